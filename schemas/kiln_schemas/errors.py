@@ -1,0 +1,138 @@
+"""Every error a user can meet, and how it travels: exception, problem+json (RFC 9457), exit code.
+
+    KilnError
+    |-- InputError          the scene, a file, a field or a setting is wrong (422, exit 3)
+    |   `-- TooLarge        a size or count is over its bound (413, exit 3)
+    |-- AuthError           no token, or a wrong one (401, exit 6)
+    |-- Forbidden           the token lacks the scope (403, exit 6)
+    |-- NotFound            no such job, task, blob or artifact (404, exit 3)
+    |-- Conflict            the request contradicts the present state (409, exit 4)
+    |   |-- StaleAttempt    a worker acts under an attempt that was taken from it
+    |   `-- IllegalTransition
+    |-- BakeFailed          a task failed for good (exit 4)
+    |   `-- FitFailed       the network did not beat P = 0, or has no signal to learn from
+    |-- Canceled            stopped on request (exit 5)
+    |-- Unreachable         the coordinator does not answer (503, exit 6)
+    |-- MachineLacks        libLLVM, disk, memory, database: what `lightkiln doctor` tells (507, exit 7)
+    `-- InternalError       a defect of ours (500, exit 1)
+
+A message names the place (mesh, file, field), the value and the remedy.
+"""
+
+from typing import ClassVar, Self
+
+from kiln_schemas.base import Contract
+
+
+class Problem(Contract):
+    """An error as `application/problem+json` and as stored with a failed task."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+    code: str
+    """Stable slug for programs: `input`, `fit-failed`, `stale-attempt`, ..."""
+    where: str | None = None
+    """The mesh, file or field at fault."""
+    remedy: str | None = None
+    """What the user can do about it."""
+
+    def sentence(self) -> str:
+        """Place, cause and remedy as one line for people."""
+        parts = [f"{self.where}: {self.detail}" if self.where else self.detail, self.remedy or ""]
+        return " ".join(p for p in parts if p)
+
+
+class KilnError(Exception):
+    """Base of all errors raised on purpose."""
+
+    code: ClassVar[str] = "error"
+    title: ClassVar[str] = "Error"
+    status: ClassVar[int] = 500
+    exit_code: ClassVar[int] = 1
+    retryable: ClassVar[bool] = False
+    """Whether another attempt of the same task may succeed."""
+
+    def __init__(self, detail: str, *, where: str | None = None, remedy: str | None = None) -> None:
+        super().__init__(detail)
+        self.detail, self.where, self.remedy = detail, where, remedy
+
+    def __str__(self) -> str:
+        return self.problem().sentence()
+
+    def problem(self) -> Problem:
+        """This error as problem+json."""
+        return Problem(
+            title=self.title,
+            status=self.status,
+            detail=self.detail,
+            code=self.code,
+            where=self.where,
+            remedy=self.remedy,
+        )
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """The exception that a problem document stands for (the class with its code)."""
+        kinds = [cls]
+        for kind in kinds:
+            kinds.extend(kind.__subclasses__())
+        match = next((kind for kind in kinds if kind.code == problem.code), cls)
+        return match(problem.detail, where=problem.where, remedy=problem.remedy)
+
+
+class InputError(KilnError):
+    code, title, status, exit_code = "input", "The input is not usable", 422, 3
+
+
+class TooLarge(InputError):
+    code, title, status = "too-large", "A size or count is over its bound", 413
+
+
+class AuthError(KilnError):
+    code, title, status, exit_code = "unauthorized", "A valid token is needed", 401, 6
+
+
+class Forbidden(KilnError):
+    code, title, status, exit_code = "forbidden", "The token lacks the scope", 403, 6
+
+
+class NotFound(KilnError):
+    code, title, status, exit_code = "not-found", "Not found", 404, 3
+
+
+class Conflict(KilnError):
+    code, title, status, exit_code = "conflict", "The request contradicts the present state", 409, 4
+
+
+class StaleAttempt(Conflict):
+    code, title = "stale-attempt", "The task was given to another attempt"
+
+
+class IllegalTransition(Conflict):
+    code, title = "illegal-transition", "The state does not allow this"
+
+
+class BakeFailed(KilnError):
+    code, title, status, exit_code = "bake-failed", "The bake failed", 500, 4
+
+
+class FitFailed(BakeFailed):
+    code, title = "fit-failed", "The fit does not represent the data"
+
+
+class Canceled(KilnError):
+    code, title, status, exit_code = "canceled", "Canceled", 409, 5
+
+
+class Unreachable(KilnError):
+    code, title, status, exit_code, retryable = "unreachable", "The coordinator does not answer", 503, 6, True
+
+
+class MachineLacks(KilnError):
+    code, title, status, exit_code, retryable = "machine-lacks", "This machine lacks something", 507, 7, True
+
+
+class InternalError(KilnError):
+    code, title, status, exit_code, retryable = "internal", "A defect in lightkiln", 500, 1, True

@@ -1,0 +1,127 @@
+"""What clients send to the coordinator and what it tells them."""
+
+from datetime import datetime
+from typing import Any
+
+from pydantic import Field
+
+from kiln_schemas.base import Contract
+from kiln_schemas.errors import InputError, Problem
+from kiln_schemas.settings import BakeSettings
+from kiln_schemas.states import JobState, TaskState
+from kiln_schemas.tasks import Bundle, Progress, Sha256, TaskKind
+
+
+class JobRequest(Contract):
+    """Body of `POST /v1/jobs`: a preset with overrides, or complete settings."""
+
+    name: str = Field(min_length=1, max_length=128)
+    bundle: Bundle
+    preset: str | None = None
+    set: tuple[str, ...] = Field(default=(), max_length=256)
+    settings: BakeSettings | None = None
+
+
+class StageView(Contract):
+    """Progress of one stage of a job, in tasks and in fractions of tasks."""
+
+    kind: TaskKind
+    total: int
+    completed: int
+    active: int
+    failed: int
+    fraction: float
+    """0..1, running tasks counted by their own progress."""
+    seconds: float
+    """Busy seconds of completed tasks, added up."""
+
+
+class JobView(Contract):
+    id: str
+    name: str
+    state: JobState
+    settings: BakeSettings
+    bundle: Bundle
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+    stages: tuple[StageView, ...]
+    remaining_s: float | None
+    """Estimate from the finished tasks; None until there is something to estimate from."""
+    notes: tuple[str, ...] = ()
+    error: Problem | None = None
+
+
+class JobPage(Contract):
+    jobs: tuple[JobView, ...]
+    next: str | None = None
+    """Cursor of the next page."""
+
+
+class TaskView(Contract):
+    id: str
+    kind: TaskKind
+    label: str
+    """`tile 16,32`, `light_field`, ..."""
+    state: TaskState
+    attempt: int
+    worker: str | None
+    progress: Progress | None
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+    error: Problem | None = None
+
+
+class EventView(Contract):
+    """One line of a job's append-only history."""
+
+    id: int
+    at: datetime
+    job_id: str
+    task_id: str | None = None
+    kind: str
+    """`job.completed`, `task.claimed`, `task.retried`, ..."""
+    actor: str
+    detail: dict[str, Any] = {}
+
+
+class MissingRequest(Contract):
+    """Body of `POST /v1/blobs/missing`."""
+
+    sha256: tuple[Sha256, ...] = Field(max_length=4096)
+
+
+class MissingReply(Contract):
+    missing: tuple[Sha256, ...]
+
+
+def check_bundle_path(path: str) -> str:
+    """A relative POSIX path that stays inside its bundle, unchanged; InputError otherwise."""
+    parts = path.split("/")
+    if (
+        path.startswith("/")
+        or "\\" in path
+        or "\0" in path
+        or any(part in ("", ".", "..") for part in parts)
+        or (len(parts[0]) > 1 and parts[0][1] == ":")
+    ):
+        raise InputError(
+            f"'{path}' leaves the bundle",
+            where="bundle.files",
+            remedy="Use relative paths with '/' and without '..' inside the scene's folder.",
+        )
+    return path
+
+
+def check_bundle(bundle: Bundle) -> Bundle:
+    """The bundle unchanged, if every path stays inside and entry and environment are among its files."""
+    for path in bundle.files:
+        check_bundle_path(path)
+    wanted = {"bundle.entry": bundle.entry}
+    if bundle.environment:
+        wanted["bundle.environment.file"] = bundle.environment.file
+    for where, path in wanted.items():
+        if path not in bundle.files:
+            raise InputError(f"'{path}' is not among the bundle's files", where=where, remedy="Add it to `files`.")
+    return bundle

@@ -1,0 +1,43 @@
+"""`manifest.json`: what a package holds, how it was made and how good it is."""
+
+from typing import Any
+
+from kiln_schemas.base import Contract
+from kiln_schemas.settings import BakeSettings
+from kiln_schemas.tasks import Artifact, FitMetrics, Sha256
+
+
+class ManifestMetrics(Contract):
+    """Errors per function; a function that was left out is None and `left_out` says why."""
+
+    light_field: FitMetrics | None
+    visibility: FitMetrics | None
+
+
+class Manifest(Contract):
+    """The package's table of contents; written last, so a package with a manifest is whole."""
+
+    format_version: int
+    generator: str
+    job_id: str
+    job_name: str
+    settings: BakeSettings
+    scene_hash: Sha256
+    inputs: dict[str, Sha256]
+    """The bundle's files."""
+    seeds: dict[str, int]
+    exposure: dict[str, float]
+    """Factor per function by which radiance was multiplied before the loss; amplitudes are in scene units again."""
+    metrics: ManifestMetrics
+    left_out: dict[str, str] = {}
+    """Artifact or function to the reason why it is absent."""
+    textures: dict[str, dict[str, Any]]
+    """Per KTX2 file: width, height, layers, lobes, channel meanings, `normalised` for environment_u."""
+    lightmap: dict[str, Any]
+    """Resolution, texels covered, valid, invalid, charts, worst texel size in metres."""
+    stage_seconds: dict[str, float]
+    overflows: int
+    versions: dict[str, str]
+    notes: tuple[str, ...]
+    files: tuple[Artifact, ...]
+    """Every other file of the package with its sha256."""

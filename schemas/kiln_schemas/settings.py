@@ -1,0 +1,159 @@
+"""What a user may choose about a bake: settings, presets and `key=value` overrides.
+
+A preset is a complete set of settings; overrides name a field by its dotted path
+(`render.samples=64`). Every bound is stated here and nowhere else.
+"""
+
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from typing import Any, Final
+
+from pydantic import Field, ValidationError, field_validator
+
+from kiln_schemas.base import Contract
+from kiln_schemas.errors import InputError
+
+
+class Function(StrEnum):
+    """The two spherical functions that are baked per texel."""
+
+    LIGHT_FIELD = "light_field"
+    """Incident radiance without the directly seen environment, three channels."""
+    VISIBILITY = "visibility"
+    """Illumination-weighted environment visibility W_E (light-field paper, eq. 7), three channels."""
+
+
+class UvPolicy(StrEnum):
+    """What to do about the light-map UV set."""
+
+    AUTO = "auto"
+    """Keep TEXCOORD_1 where it is unique and inside [0, 1]; unwrap otherwise."""
+    KEEP = "keep"
+    """The scene's set is final: refuse the scene where it is missing, overlaps or leaves [0, 1]."""
+    UNWRAP = "unwrap"
+    """Always unwrap."""
+
+
+class LightmapSettings(Contract):
+    """The light map: one atlas for the whole scene."""
+
+    resolution: int = Field(ge=8, le=8192, description="texels along each side")
+    padding: int = Field(default=2, ge=1, le=16, description="empty texels between charts when unwrapping")
+    uv: UvPolicy = UvPolicy.AUTO
+    tile: int = Field(default=16, ge=4, le=64, description="texels along each side of a render tile")
+
+
+class RenderSettings(Contract):
+    """Path tracing of the local light fields."""
+
+    image_size: int = Field(ge=16, le=256, description="pixels along each side of a light-field image")
+    samples: int = Field(default=16, ge=1, le=65536, description="paths per light-field pixel")
+    irradiance_samples: int = Field(default=1024, ge=1, le=1_000_000, description="paths per texel")
+    max_depth: int = Field(default=6, ge=1, le=64, description="scattering events on a path, at most")
+
+    @field_validator("image_size")
+    @classmethod
+    def _pools_four_times(cls, value: int) -> int:
+        if value % 16:
+            raise ValueError("must be a multiple of 16 (the network halves the image four times)")
+        return value
+
+
+class FitSettings(Contract):
+    """Training of the network that turns light-field images into lobes."""
+
+    lobes: int = Field(ge=1, le=64, description="spherical Gaussians per texel")
+    steps: int = Field(ge=1, le=1_000_000, description="optimiser steps per network")
+    batch: int = Field(default=32, ge=1, le=1024, description="texels per step")
+    learning_rate: float = Field(default=1e-3, gt=0, le=1)
+    window: int = Field(default=2048, ge=1, le=1_000_000, description="texels in the shuffle window")
+
+
+class PackageSettings(Contract):
+    """What is written besides the textures."""
+
+    environment_size: int = Field(default=128, ge=16, le=1024, description="side of the GGX cube's largest mip")
+
+
+class BakeSettings(Contract):
+    """Everything that determines a bake, apart from the scene and the environment."""
+
+    preset: str
+    seed: int = Field(default=0, ge=0, le=2**32 - 1)
+    lightmap: LightmapSettings
+    render: RenderSettings
+    fit: FitSettings
+    package: PackageSettings = PackageSettings()
+
+
+PRESETS: Final[Mapping[str, BakeSettings]] = {
+    "draft": BakeSettings(
+        preset="draft",
+        lightmap=LightmapSettings(resolution=32, tile=8),
+        render=RenderSettings(image_size=32, samples=16, irradiance_samples=512),
+        fit=FitSettings(lobes=8, steps=600),
+        package=PackageSettings(environment_size=64),
+    ),
+    "preview": BakeSettings(
+        preset="preview",
+        lightmap=LightmapSettings(resolution=64),
+        render=RenderSettings(image_size=64, samples=32),
+        fit=FitSettings(lobes=16, steps=2500),
+    ),
+    "production": BakeSettings(
+        preset="production",
+        lightmap=LightmapSettings(resolution=512),
+        render=RenderSettings(image_size=128, samples=64, irradiance_samples=4096, max_depth=8),
+        fit=FitSettings(lobes=16, steps=60_000),
+        package=PackageSettings(environment_size=256),
+    ),
+}
+
+
+def make_settings(preset: str, overrides: Sequence[str] = ()) -> BakeSettings:
+    """The settings of a preset with `dotted.key=value` overrides applied; InputError names what is wrong."""
+    if preset not in PRESETS:
+        raise InputError(f"'{preset}' is not a preset", where="preset", remedy=f"Choose one of {', '.join(PRESETS)}.")
+    tree = PRESETS[preset].model_dump(mode="json")
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if not equals:
+            raise InputError(f"'{override}' has no '='", where="--set", remedy="Write it as key=value.")
+        _assign(tree, key.strip(), value.strip())
+    return parse_settings(tree)
+
+
+def parse_settings(tree: Mapping[str, Any]) -> BakeSettings:
+    """Validate a settings document; InputError names the first field at fault, its value and its bound."""
+    try:
+        return BakeSettings.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "settings"
+        raise InputError(
+            f"{first.get('input')!r} is refused: {first['msg']}", where=where, remedy="See `lightkiln bake --help`."
+        ) from None
+
+
+def setting_keys() -> list[str]:
+    """All dotted keys that `--set` takes."""
+    return [".".join(path) for path in _leaves(PRESETS["draft"].model_dump(mode="json"))]
+
+
+def _leaves(tree: Mapping[str, Any], prefix: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    out: list[tuple[str, ...]] = []
+    for key, value in tree.items():
+        out += _leaves(value, (*prefix, key)) if isinstance(value, dict) else [(*prefix, key)]
+    return out
+
+
+def _assign(tree: dict[str, Any], key: str, value: str) -> None:
+    if key not in setting_keys() or key == "preset":
+        raise InputError(
+            f"'{key}' is not a setting", where="--set", remedy=f"Settings: {', '.join(setting_keys()[1:])}."
+        )
+    *path, leaf = key.split(".")
+    node = tree
+    for part in path:
+        node = node[part]
+    node[leaf] = value

@@ -1,0 +1,241 @@
+"""What a worker is given (payloads) and what it hands back (results), per kind of task.
+
+All data between tasks travel as content-addressed blobs through the coordinator, except the
+light-field store, which workers write and read directly at `store_url`.
+"""
+
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from kiln_schemas.base import Contract
+from kiln_schemas.errors import Problem
+from kiln_schemas.settings import BakeSettings, Function
+
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+BundlePath = Annotated[str, Field(min_length=1, max_length=512)]
+
+
+class TaskKind(StrEnum):
+    """The stages of a bake; a worker offers some of them."""
+
+    PREPARE = "prepare"
+    RENDER = "render"
+    FIT = "fit"
+    PACKAGE = "package"
+
+
+class EnvironmentRef(Contract):
+    """The distant illumination: an equirectangular HDR or EXR of the bundle."""
+
+    file: BundlePath
+    scale: float = Field(default=1.0, gt=0, le=1e6)
+    rotation_deg: float = Field(default=0.0, ge=-360, le=360)
+    """About +Y, counter-clockwise seen from above."""
+
+
+class Bundle(Contract):
+    """A scene as a set of blobs: relative POSIX paths to hashes."""
+
+    entry: BundlePath
+    files: dict[BundlePath, Sha256] = Field(min_length=1, max_length=4096)
+    environment: EnvironmentRef | None = None
+
+
+class Tile(Contract):
+    """A square of the light map: first row and column, texels along each side, texels that have a surface point."""
+
+    row: int = Field(ge=0)
+    column: int = Field(ge=0)
+    size: int = Field(ge=1)
+    texels: int = Field(ge=0)
+
+
+class PreparePayload(Contract):
+    kind: Literal[TaskKind.PREPARE] = TaskKind.PREPARE
+    bundle: Bundle
+    settings: BakeSettings
+    store_url: str
+
+
+class RenderPayload(Contract):
+    kind: Literal[TaskKind.RENDER] = TaskKind.RENDER
+    scene: Sha256
+    texel_map: Sha256
+    tile: Tile
+    settings: BakeSettings
+    store_url: str
+
+
+class FitPayload(Contract):
+    kind: Literal[TaskKind.FIT] = TaskKind.FIT
+    function: Function
+    texel_map: Sha256
+    renders: tuple["RenderResult", ...]
+    settings: BakeSettings
+    store_url: str
+
+
+class PackagePayload(Contract):
+    kind: Literal[TaskKind.PACKAGE] = TaskKind.PACKAGE
+    job_id: str
+    job_name: str
+    bundle: Bundle
+    prepare: "PrepareResult"
+    renders: tuple["RenderResult", ...]
+    fits: tuple["FitResult", ...]
+    settings: BakeSettings
+    store_url: str
+
+
+Payload = Annotated[PreparePayload | RenderPayload | FitPayload | PackagePayload, Field(discriminator="kind")]
+
+
+class PrepareResult(Contract):
+    kind: Literal[TaskKind.PREPARE] = TaskKind.PREPARE
+    scene: Sha256
+    """The parsed scene (`kiln_workers.scene.archive`)."""
+    texel_map: Sha256
+    """The texel map (`kiln_workers.scene.texels`)."""
+    scene_hash: Sha256
+    """Hash of all that the light depends on; render seeds derive from it."""
+    tiles: tuple[Tile, ...]
+    """Only tiles with at least one texel."""
+    has_environment: bool
+    has_light: bool
+    triangles: int
+    notes: tuple[str, ...] = ()
+    """What was decided for the user: per-mesh unwrapping, ignored features, dropped faces."""
+    seconds: float
+
+
+class RenderResult(Contract):
+    kind: Literal[TaskKind.RENDER] = TaskKind.RENDER
+    tile: Tile
+    paths: int
+    overflows: int
+    """Values clamped to the fp16 range."""
+    invalid: int
+    """Texels that see mostly back faces; filled from their neighbours when packaging."""
+    invalid_texels: tuple[int, ...] = ()
+    """Those texels, as row-major indices inside the tile."""
+    seconds: float
+
+
+class FitMetrics(Contract):
+    """Errors as defined in docs/mathematics.md (`log_mse`: no jitter, exposure-normalised)."""
+
+    log_mse: float
+    log_mse_zero: float
+    """log_mse of P = 0."""
+    log_mse_rel: float
+    texels: int
+    signal: bool
+    """False where the function is zero everywhere and there is nothing to fit."""
+
+
+class CurvePoint(Contract):
+    step: int
+    loss: float
+    """The jittered training loss, not the error."""
+
+
+class FitResult(Contract):
+    kind: Literal[TaskKind.FIT] = TaskKind.FIT
+    function: Function
+    weights: Sha256
+    exposure: float
+    metrics: FitMetrics
+    curve: tuple[CurvePoint, ...]
+    steps: int
+    seconds: float
+
+
+class Artifact(Contract):
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", max_length=200)]
+    sha256: Sha256
+    size: int = Field(ge=0)
+    media_type: str
+
+
+class PackageResult(Contract):
+    kind: Literal[TaskKind.PACKAGE] = TaskKind.PACKAGE
+    artifacts: tuple[Artifact, ...]
+    seconds: float
+
+
+Result = Annotated[PrepareResult | RenderResult | FitResult | PackageResult, Field(discriminator="kind")]
+
+
+class Progress(Contract):
+    """How far a running attempt is; `done` of `total` in the unit of its kind."""
+
+    done: float = Field(ge=0)
+    total: float = Field(gt=0)
+    unit: str
+    message: str = ""
+    loss: float | None = None
+
+
+class WorkerRegistration(Contract):
+    name: str = Field(min_length=1, max_length=128)
+    kinds: tuple[TaskKind, ...] = Field(min_length=1)
+    memory_bytes: int = Field(gt=0)
+    threads: int = Field(gt=0)
+    device: str
+    version: str
+
+
+class WorkerWelcome(Contract):
+    worker_id: str
+    heartbeat_s: float
+    """Beat at least this often while a task runs."""
+
+
+class ClaimRequest(Contract):
+    kinds: tuple[TaskKind, ...] = Field(min_length=1)
+    wait_s: float = Field(default=10.0, ge=0, le=30)
+    """Long-poll: how long the coordinator may hold the request while there is nothing to do."""
+
+
+class Claim(Contract):
+    """A task handed to a worker under a fence: every later call carries `attempt`."""
+
+    task_id: str
+    job_id: str
+    attempt: int
+    payload: Payload
+    checkpoint: Sha256 | None = None
+    """The last checkpoint that an earlier attempt published."""
+
+
+class Heartbeat(Contract):
+    task_id: str
+    attempt: int
+    progress: Progress | None = None
+    log: str = Field(default="", max_length=65536)
+    """Lines written since the last beat."""
+
+
+class HeartbeatReply(Contract):
+    stop: bool
+    """The attempt is no longer wanted: drop the work."""
+    reason: str = ""
+
+
+class Commit(Contract):
+    attempt: int
+    result: Result
+
+
+class Failure(Contract):
+    attempt: int
+    problem: Problem
+    retryable: bool
+    log: str = Field(default="", max_length=65536)
+
+
+class Checkpoint(Contract):
+    attempt: int
+    sha256: Sha256
