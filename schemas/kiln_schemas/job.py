@@ -83,7 +83,7 @@ class EventView(Contract):
     kind: str
     """`job.completed`, `task.claimed`, `task.retried`, ..."""
     actor: str
-    detail: dict[str, Any] = {}
+    detail: dict[str, Any] = Field(default_factory=dict)
 
 
 class MissingRequest(Contract):

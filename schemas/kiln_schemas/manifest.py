@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from pydantic import Field
+
 from kiln_schemas.base import Contract
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.tasks import Artifact, FitMetrics, Sha256
@@ -29,7 +31,7 @@ class Manifest(Contract):
     exposure: dict[str, float]
     """Factor per function by which radiance was multiplied before the loss; amplitudes are in scene units again."""
     metrics: ManifestMetrics
-    left_out: dict[str, str] = {}
+    left_out: dict[str, str] = Field(default_factory=dict)
     """Artifact or function to the reason why it is absent."""
     textures: dict[str, dict[str, Any]]
     """Per KTX2 file: width, height, layers, lobes, channel meanings, `normalised` for environment_u."""

@@ -26,10 +26,10 @@ class Image:
 
 @dataclass(frozen=True)
 class TextureRef:
-    """A texture lookup: image index, wrap modes `repeat|clamp|mirror`, KHR_texture_transform as (offset, scale, angle)."""
+    """A texture lookup; `offset`, `scale` and `rotation` as in KHR_texture_transform."""
 
     image: int
-    wrap: tuple[str, str] = ("repeat", "repeat")
+    wrap: tuple[str, str] = ("repeat", "repeat")  # each of repeat, clamp, mirror
     offset: tuple[float, float] = (0.0, 0.0)
     scale: tuple[float, float] = (1.0, 1.0)
     rotation: float = 0.0  # radians, as KHR_texture_transform
