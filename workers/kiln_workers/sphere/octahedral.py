@@ -27,7 +27,7 @@ def encode(directions: Floats) -> Floats:
     p = directions / np.abs(directions).sum(axis=-1, keepdims=True)
     xy = p[..., :2]
     folded = (1.0 - np.abs(xy[..., ::-1])) * np.copysign(1.0, xy)
-    return np.where(p[..., 2:] < 0.0, folded, xy)
+    return np.asarray(np.where(p[..., 2:] < 0.0, folded, xy))
 
 
 def jacobian(xy: Floats) -> Floats:
