@@ -1,46 +1,80 @@
 """Filling what no surface covers: gutters between charts and texels whose point lies inside geometry.
 
-A bilinear lookup near a chart's border reads texels outside it. They must therefore continue the chart: a texel
-without data takes the value of the nearest texel with data (exact Euclidean distance, as in Rong and Tan 2006's jump
-flooding, here by SciPy's distance transform). Lobes are copied whole, because the k-th lobe of two texels correspond
-only as far as the network made them: an average over several charts would put lobes where neither had any.
-Irradiance, a plain colour, is smoothed inside the filled region (a few Jacobi steps of Laplace's equation from the
-nearest values) so that mip maps and compressors see no cell borders. Valid texels are never changed.
+A bilinear lookup near a chart's border reads texels outside it, so these must continue the chart. Each texel without
+data takes its values from one source texel: a covered one from the nearest valid texel of its own chart, any other
+from the nearest covered one (exact Euclidean distance transform, Maurer et al. 2003, by SciPy). Lobes are copied whole,
+because the k-th lobes of two texels correspond only as far as the network made them: an average over several charts
+would put lobes where neither had any. Irradiance is a plain colour: beyond the rings that a filter can reach it is
+smoothed by Jacobi steps of Laplace's equation, so that mip maps and compressors see no cell borders. Valid texels are
+never changed.
 """
+
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import distance_transform_edt
-
 from kiln_schemas.errors import InternalError
+from scipy.ndimage import distance_transform_edt, find_objects
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
+Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 
-SMOOTHING_STEPS = 16
+SHARP_RINGS: Final = 4
+"""Texels this near to a chart keep their source's value exactly: filters that read them must see that chart alone."""
+
+SMOOTHING_STEPS: Final = 16
 
 
-def nearest_filled(filled: Bools) -> tuple[Int64, Int64]:
-    """Row and column [H, W] of the nearest texel with data, for each texel; a texel with data is its own nearest."""
-    if not filled.any():
+@dataclass(frozen=True)
+class Fill:
+    """Where each texel [H, W] takes its values from; a valid texel is its own source."""
+
+    rows: Int64
+    columns: Int64
+    distance: npt.NDArray[np.float64]
+    """Texels to the source."""
+
+    def nearest(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """`values` [H, W, ...] with every texel replaced by its source's."""
+        return values[self.rows, self.columns]
+
+    def smooth(self, values: Float32, steps: int = SMOOTHING_STEPS) -> Float32:
+        """`nearest`, then `steps` averages with the four neighbours [H, W, C] beyond SHARP_RINGS of any source."""
+        out: Float32 = self.nearest(values).astype(np.float32)
+        keep = (self.distance <= SHARP_RINGS)[..., None]
+        for _ in range(steps):
+            padded = np.pad(out, ((1, 1), (1, 1), (0, 0)), mode="edge")
+            mean = 0.25 * (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:])
+            out = np.where(keep, out, mean).astype(np.float32)
+        return out
+
+
+def plan_fill(valid: Bools, chart: Int32) -> Fill:
+    """Sources for every texel of a light map, from its valid texels [H, W] and chart numbers [H, W] (-1: gutter)."""
+    if not valid.any():
         raise InternalError("no texel of the light map has data", where="package")
-    indices = distance_transform_edt(~filled, return_distances=False, return_indices=True)
-    return indices[0].astype(np.int64), indices[1].astype(np.int64)
+    rows, columns = (np.ascontiguousarray(grid) for grid in np.indices(valid.shape))
+    known = valid.copy()
 
+    # Fill covered texels without data from their own chart, where that chart has any.
+    boxes = find_objects(chart + 1)
+    for number in np.unique(chart[~valid & (chart >= 0)]):
+        box = boxes[number]
+        inside = chart[box] == number
+        own = inside & valid[box]
+        if not own.any():
+            continue
+        nearest = distance_transform_edt(~own, return_distances=False, return_indices=True)
+        filled = inside & ~own
+        rows[box][filled] = nearest[0][filled] + box[0].start
+        columns[box][filled] = nearest[1][filled] + box[1].start
+        known[box] |= inside
 
-def fill_nearest(values: npt.NDArray[np.generic], filled: Bools) -> npt.NDArray[np.generic]:
-    """`values` [H, W, ...] with each texel outside `filled` [H, W] replaced by its nearest filled one's."""
-    rows, columns = nearest_filled(filled)
-    return values[rows, columns]
-
-
-def fill_smooth(values: Float32, filled: Bools, steps: int = SMOOTHING_STEPS) -> Float32:
-    """`fill_nearest`, then `steps` averages of each filled-in texel [H, W, C] with its four neighbours."""
-    out = np.asarray(fill_nearest(values, filled), dtype=np.float32)
-    keep = filled[..., None]
-    for _ in range(steps):
-        padded = np.pad(out, ((1, 1), (1, 1), (0, 0)), mode="edge")
-        mean = 0.25 * (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:])
-        out = np.where(keep, out, mean)
-    return out
+    # Fill the rest from the nearest texel that has a source by now.
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    rows, columns = rows[nearest[0], nearest[1]], columns[nearest[0], nearest[1]]
+    here = np.indices(valid.shape)
+    return Fill(rows, columns, np.hypot(rows - here[0], columns - here[1]))
