@@ -1,0 +1,188 @@
+"""From a reader's raw vertices and faces to a `Mesh` in world space: checks, transform, winding, normals, clean-up.
+
+Every reader ends here, so that what counts as a bad vertex, a degenerate face or a missing normal is decided once.
+Rules: positions must be finite; a transform of negative determinant flips the winding, so that the outward side stays
+outward (glTF 2.0, 3.7.4); missing normals become flat ones, for which vertices are split (glTF 2.0, 3.7.2.1);
+degenerate faces are dropped with a note.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from kiln_schemas.errors import InputError, TooLarge
+from kiln_workers.scene.model import Mesh
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+MAX_TRIANGLES = 20_000_000
+SLIVER = 1e-7
+"""A face whose height is below this part of its longest edge is degenerate (float32 cannot tell its plane)."""
+
+
+@dataclass(frozen=True)
+class RawMesh:
+    """A primitive as a file gives it, in its own space."""
+
+    name: str
+    positions: Floats  # [V, 3]
+    faces: Ints  # [F, 3]
+    material: int
+    normals: Floats | None = None  # [V, 3], any length
+    uv: Floats | None = None  # [V, 2], v downwards
+    lightmap_uv: Floats | None = None  # [V, 2]
+
+
+def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, list[str]]:
+    """The mesh in world space under a 4 x 4 transform (column vectors), None if no face is left, and notes."""
+    _check(raw)
+    notes: list[str] = []
+    matrix = np.eye(4) if transform is None else np.asarray(transform, dtype=np.float64)
+    if not np.isfinite(matrix).all():
+        raise InputError("its transform is not finite", where=_where(raw), remedy="Mend the node's transform.")
+    linear = matrix[:3, :3]
+    with np.errstate(over="ignore"):
+        positions = (raw.positions @ linear.T + matrix[:3, 3]).astype(np.float32)
+    _check_finite(positions, raw, "leaves the float range under its transform")
+    mirrored = bool(np.linalg.det(linear) < 0.0)
+    faces = raw.faces[:, ::-1] if mirrored else raw.faces
+
+    keep = _sound_faces(positions.astype(np.float64), faces)
+    dropped = len(faces) - int(keep.sum())
+    if dropped:
+        notes.append(f"Mesh '{raw.name}': {dropped} degenerate face{'s' if dropped > 1 else ''} dropped.")
+    if dropped == len(faces):
+        return None, notes
+    faces = faces[keep]
+    used, compact = np.unique(faces, return_inverse=True)
+    faces = compact.reshape(-1, 3)
+    positions = positions[used]
+    uv = _picked(raw.uv, used)
+    lightmap_uv = _picked(raw.lightmap_uv, used)
+    if raw.normals is None:
+        corners = faces.reshape(-1)
+        positions = positions[corners]
+        uv, lightmap_uv = _picked(uv, corners), _picked(lightmap_uv, corners)
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        normals = np.repeat(face_normals(positions, faces), 3, axis=0)
+    else:
+        normals, mended = _transformed_normals(raw.normals[used], linear, positions, faces)
+        if mended:
+            notes.append(f"Mesh '{raw.name}': {mended} unusable vertex normals replaced by those of its faces.")
+    mesh = Mesh(
+        name=raw.name,
+        positions=np.ascontiguousarray(positions),
+        normals=normals.astype(np.float32),
+        faces=faces.astype(np.int32),
+        material=raw.material,
+        uv=None if uv is None else uv.astype(np.float32),
+        lightmap_uv=None if lightmap_uv is None else lightmap_uv.astype(np.float32),
+    )
+    return mesh, notes
+
+
+def check_triangle_count(count: int, where: str) -> None:
+    """Raise TooLarge beyond the bound; readers call it before they make copies."""
+    if count > MAX_TRIANGLES:
+        raise TooLarge(
+            f"has more than {MAX_TRIANGLES} triangles with all its instances", where=where, remedy="Simplify it."
+        )
+
+
+def face_normals(positions: npt.NDArray[np.float32] | Floats, faces: npt.NDArray[np.integer]) -> Floats:
+    """Unit geometric normals [F, 3], counter-clockwise outward; zero where a face has no area."""
+    cross = _double_areas(np.asarray(positions, dtype=np.float64), faces)
+    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    return np.asarray(np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0))
+
+
+def face_areas(positions: npt.NDArray[np.float32] | Floats, faces: npt.NDArray[np.integer]) -> Floats:
+    """World areas [F] in square metres."""
+    cross = _double_areas(np.asarray(positions, dtype=np.float64), faces)
+    return np.asarray(0.5 * np.linalg.norm(cross, axis=1))
+
+
+def smooth_normals(positions: Floats, faces: npt.NDArray[np.integer]) -> Floats:
+    """Area-weighted unit vertex normals [V, 3]; zero at vertices that no face uses."""
+    total = np.zeros((len(positions), 3))
+    cross = _double_areas(positions, faces)
+    for corner in range(3):
+        np.add.at(total, faces[:, corner], cross)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0.0))
+
+
+def unique_names(names: Iterable[str]) -> list[str]:
+    """The names in order, repeated ones with ` (2)`, ` (3)`, ... appended."""
+    seen: dict[str, int] = {}
+    out = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        out.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
+    return out
+
+
+def _double_areas(positions: Floats, faces: npt.NDArray[np.integer]) -> Floats:
+    a, b, c = (positions[faces[:, corner]] for corner in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def _sound_faces(positions: Floats, faces: Ints) -> npt.NDArray[np.bool_]:
+    corners = positions[faces]  # [F, 3, 3]
+    longest = (np.diff(corners[:, [0, 1, 2, 0]], axis=1) ** 2).sum(axis=2).max(axis=1)
+    cross = np.linalg.norm(_double_areas(positions, faces), axis=1)
+    return np.asarray(cross > SLIVER * longest)
+
+
+def _transformed_normals(
+    normals: Floats, linear: Floats, positions: npt.NDArray[np.float32], faces: Ints
+) -> tuple[Floats, int]:
+    # The cofactor matrix is det(M) M^-T and exists for singular M too; its sign is taken out for mirrors.
+    a, b, c = linear[:, 0], linear[:, 1], linear[:, 2]
+    cofactor = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    sign = -1.0 if np.linalg.det(linear) < 0.0 else 1.0
+    bad = ~np.isfinite(normals).all(axis=1)
+    world = np.where(bad[:, None], 0.0, normals) @ (sign * cofactor).T
+    length = np.linalg.norm(world, axis=1, keepdims=True)
+    bad |= length[:, 0] <= 1e-30
+    world = world / np.where(length > 1e-30, length, 1.0)
+    if bad.any():
+        world[bad] = smooth_normals(positions.astype(np.float64), faces)[bad]
+    return world, int(bad.sum())
+
+
+def _check(raw: RawMesh) -> None:
+    _check_finite(raw.positions, raw, "is not a finite number")
+    if len(raw.faces) and (raw.faces.min() < 0 or raw.faces.max() >= len(raw.positions)):
+        face = int(np.argmax(((raw.faces < 0) | (raw.faces >= len(raw.positions))).any(axis=1)))
+        raise InputError(
+            f"face {face} names vertex {int(raw.faces[face].max())}, but there are {len(raw.positions)}",
+            where=_where(raw),
+            remedy="Export the mesh again.",
+        )
+    for label, uv in (("UV", raw.uv), ("light-map UV", raw.lightmap_uv)):
+        if uv is not None and not np.isfinite(uv).all():
+            vertex = int(np.argmax(~np.isfinite(uv).all(axis=1)))
+            raise InputError(f"the {label} of vertex {vertex} is not a finite number", where=_where(raw))
+
+
+def _check_finite(positions: npt.NDArray[np.floating], raw: RawMesh, what: str) -> None:
+    finite = np.isfinite(positions).all(axis=1)
+    if not finite.all():
+        vertex = int(np.argmin(finite))
+        raise InputError(
+            f"the position of vertex {vertex} {what} ({', '.join(str(x) for x in raw.positions[vertex])})",
+            where=_where(raw),
+            remedy="Mend the mesh.",
+        )
+
+
+def _picked(values: Floats | None, rows: Ints) -> Floats | None:
+    return None if values is None else values[rows]
+
+
+def _where(raw: RawMesh) -> str:
+    return f"mesh '{raw.name}'"

@@ -1,0 +1,183 @@
+"""Buffers, buffer views and accessors of a glTF file, every offset checked before it is used (glTF 2.0, 3.6).
+
+Reads strided, interleaved, sparse and normalised accessors into float64 or int64 arrays. Whatever leaves its buffer is
+an InputError that names the accessor, never an exception of numpy's.
+"""
+
+import base64
+import binascii
+import struct
+from dataclasses import dataclass, field
+from typing import Final
+from urllib.parse import unquote
+
+import numpy as np
+import numpy.typing as npt
+
+from kiln_schemas.errors import InputError
+from kiln_workers.scene.bundle import BundleFolder
+from kiln_workers.scene.gltf_document import Accessor, Document, pick
+
+COMPONENTS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+DTYPES: Final = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+MAX_ELEMENTS: Final = 200_000_000
+
+GLB_MAGIC: Final = b"glTF"
+CHUNK_JSON: Final = 0x4E4F534A
+CHUNK_BIN: Final = 0x004E4942
+
+
+def split_glb(data: bytes, where: str) -> tuple[bytes, bytes | None]:
+    """JSON and binary chunk of a GLB file (glTF 2.0, 4.4); a file of plain JSON passes with None."""
+    if data[:4] != GLB_MAGIC:
+        return data, None
+    if len(data) < 20:
+        raise _broken("its GLB header is cut off", where)
+    version, length = struct.unpack_from("<II", data, 4)
+    if version != 2:
+        raise InputError(f"is GLB version {version}", where=where, remedy="Export it as glTF 2.0.")
+    if length > len(data):
+        raise _broken(f"it should have {length} bytes and has {len(data)}", where)
+    chunks: dict[int, bytes] = {}
+    offset = 12
+    while offset + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, offset)
+        offset += 8
+        if offset + size > length:
+            raise _broken(f"a chunk of {size} bytes leaves the file", where)
+        chunks.setdefault(kind, data[offset : offset + size])
+        offset += size
+    if CHUNK_JSON not in chunks:
+        raise _broken("it has no JSON chunk", where)
+    return chunks[CHUNK_JSON], chunks.get(CHUNK_BIN)
+
+
+def decode_data_uri(uri: str, where: str) -> bytes:
+    """The bytes of a `data:` URI (RFC 2397)."""
+    head, comma, body = uri.partition(",")
+    if not comma:
+        raise _broken("a data: URI has no comma", where)
+    try:
+        return base64.b64decode(body, validate=True) if head.endswith(";base64") else unquote(body).encode("latin-1")
+    except (binascii.Error, UnicodeEncodeError):
+        raise _broken("a data: URI cannot be decoded", where) from None
+
+
+@dataclass
+class GltfBuffers:
+    """Access to the binary data of one document."""
+
+    document: Document
+    folder: BundleFolder
+    binary: bytes | None
+    _loaded: dict[int, bytes] = field(default_factory=dict)
+
+    def file(self, uri: str, what: str) -> bytes:
+        """The bytes behind a URI: inline data or a file of the bundle."""
+        if uri.startswith("data:"):
+            return decode_data_uri(uri, self.folder.origin)
+        return self.folder.read(unquote(uri), what)
+
+    def view(self, index: int) -> bytes:
+        """The bytes of a buffer view."""
+        where = self.folder.origin
+        view = pick(self.document.buffer_views, index, "buffer view", where)
+        data = self._buffer(view.buffer)
+        if view.byte_offset + view.byte_length > len(data):
+            raise _broken(
+                f"buffer view {index} ends at byte {view.byte_offset + view.byte_length} of a buffer of {len(data)}",
+                where,
+            )
+        return data[view.byte_offset : view.byte_offset + view.byte_length]
+
+    def floats(self, index: int, width: int, what: str) -> npt.NDArray[np.float64]:
+        """Accessor `index` as [count, width], normalised integers mapped to [0, 1] or [-1, 1]."""
+        accessor, values = self._read(index, width, what)
+        out = values.astype(np.float64)
+        if accessor.component_type == 5126:
+            return out
+        if not accessor.normalized:
+            return out
+        return np.maximum(out / np.iinfo(values.dtype).max, -1.0)
+
+    def indices(self, index: int) -> npt.NDArray[np.int64]:
+        """Accessor `index` as unsigned integers [count]."""
+        accessor, values = self._read(index, 1, "indices")
+        if accessor.component_type not in (5121, 5123, 5125):
+            raise _broken(f"accessor {index} (indices) does not hold unsigned integers", self.folder.origin)
+        return values[:, 0].astype(np.int64)
+
+    def _buffer(self, index: int) -> bytes:
+        if index not in self._loaded:
+            where = self.folder.origin
+            buffer = pick(self.document.buffers, index, "buffer", where)
+            if buffer.uri is not None:
+                data = self.file(buffer.uri, "buffer")
+            elif index == 0 and self.binary is not None:
+                data = self.binary
+            else:
+                raise _broken(f"buffer {index} has neither a URI nor a binary chunk", where)
+            if len(data) < buffer.byte_length:
+                raise _broken(f"buffer {index} should have {buffer.byte_length} bytes and has {len(data)}", where)
+            self._loaded[index] = data[: buffer.byte_length]
+        return self._loaded[index]
+
+    def _read(self, index: int, width: int, what: str) -> tuple[Accessor, npt.NDArray[np.generic]]:
+        where = self.folder.origin
+        accessor = pick(self.document.accessors, index, "accessor", where)
+        label = f"accessor {index} ({what})"
+        if COMPONENTS[accessor.type] != width:
+            raise _broken(f"{label} is {accessor.type}, not of {width} components", where)
+        if accessor.count * width > MAX_ELEMENTS:
+            raise _broken(f"{label} has {accessor.count} elements", where)
+        dtype = np.dtype(DTYPES[accessor.component_type])
+        if accessor.buffer_view is None:
+            values = np.zeros((accessor.count, width), dtype)
+        else:
+            stride = pick(self.document.buffer_views, accessor.buffer_view, "buffer view", where).byte_stride
+            data = self.view(accessor.buffer_view)
+            values = _strided(data, accessor.byte_offset, stride, accessor.count, width, dtype, label, where)
+        if accessor.sparse is not None:
+            values = self._with_sparse(accessor, values, label)
+        return accessor, values
+
+    def _with_sparse(self, accessor: Accessor, values: npt.NDArray[np.generic], label: str) -> npt.NDArray[np.generic]:
+        assert accessor.sparse is not None
+        where, sparse = self.folder.origin, accessor.sparse
+        if sparse.count > accessor.count:
+            raise _broken(f"{label} is sparse with {sparse.count} of {accessor.count} values", where)
+        kind = np.dtype(DTYPES[sparse.indices.component_type])
+        data = self.view(sparse.indices.buffer_view)
+        rows = _strided(data, sparse.indices.byte_offset, None, sparse.count, 1, kind, label, where)[:, 0]
+        rows = rows.astype(np.int64)
+        if len(rows) and (rows.max() >= accessor.count or (np.diff(rows) <= 0).any()):
+            raise _broken(f"the sparse indices of {label} do not rise or leave it", where)
+        data = self.view(sparse.values.buffer_view)
+        fresh = _strided(
+            data, sparse.values.byte_offset, None, sparse.count, values.shape[1], values.dtype, label, where
+        )
+        out = values.copy()
+        out[rows] = fresh
+        return out
+
+
+def _strided(
+    data: bytes,
+    offset: int,
+    stride: int | None,
+    count: int,
+    width: int,
+    dtype: np.dtype[np.generic],
+    label: str,
+    where: str,
+) -> npt.NDArray[np.generic]:
+    size = width * dtype.itemsize
+    step = size if stride is None else stride
+    if step < size or offset + (count - 1) * step + size > len(data):
+        raise _broken(f"{label} leaves its buffer view of {len(data)} bytes", where)
+    rows = np.ndarray((count, size), np.uint8, buffer=data, offset=offset, strides=(step, 1))
+    return np.ascontiguousarray(rows).view(dtype).reshape(count, width)
+
+
+def _broken(detail: str, where: str) -> InputError:
+    return InputError(f"is broken: {detail}", where=where, remedy="Export it again.")

@@ -1,0 +1,235 @@
+"""The part of glTF 2.0's JSON that is read, as frozen models: field types, ranges and defaults of the specification.
+
+A scene file is a stranger's: validating the document once means that the reader may trust its types, and that every
+malformed field is refused with its path. Unknown fields are ignored, as the specification asks.
+"""
+
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.alias_generators import to_camel
+
+from kiln_schemas.errors import InputError
+
+Index = Annotated[int, Field(ge=0, le=2**31 - 1)]
+Count = Annotated[int, Field(ge=1, le=2**31 - 1)]
+Bytes = Annotated[int, Field(ge=0, le=2**40)]
+Vector2 = tuple[float, float]
+Vector3 = tuple[float, float, float]
+Vector4 = tuple[float, float, float, float]
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+Extensions = dict[str, dict[str, Any]]
+T = TypeVar("T")
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False, alias_generator=to_camel)
+
+
+P = TypeVar("P", bound=_Part)
+
+
+class Buffer(_Part):
+    byte_length: Bytes
+    uri: str | None = None
+
+
+class BufferView(_Part):
+    buffer: Index
+    byte_offset: Bytes = 0
+    byte_length: Bytes
+    byte_stride: Annotated[int, Field(ge=4, le=252)] | None = None
+
+
+class SparseIndices(_Part):
+    buffer_view: Index
+    byte_offset: Bytes = 0
+    component_type: Literal[5121, 5123, 5125]
+
+
+class SparseValues(_Part):
+    buffer_view: Index
+    byte_offset: Bytes = 0
+
+
+class Sparse(_Part):
+    count: Count
+    indices: SparseIndices
+    values: SparseValues
+
+
+class Accessor(_Part):
+    buffer_view: Index | None = None
+    byte_offset: Bytes = 0
+    component_type: Literal[5120, 5121, 5122, 5123, 5125, 5126]
+    normalized: bool = False
+    count: Count
+    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+    sparse: Sparse | None = None
+
+
+class Primitive(_Part):
+    attributes: dict[str, Index]
+    indices: Index | None = None
+    material: Index | None = None
+    mode: Annotated[int, Field(ge=0, le=6)] = 4
+    targets: list[Any] = []
+    extensions: Extensions = {}
+
+
+class MeshPart(_Part):
+    name: str = ""
+    primitives: list[Primitive] = []
+
+
+class Node(_Part):
+    name: str = ""
+    children: list[Index] = []
+    mesh: Index | None = None
+    skin: Index | None = None
+    matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
+    translation: Vector3 = (0.0, 0.0, 0.0)
+    rotation: Vector4 = (0.0, 0.0, 0.0, 1.0)
+    scale: Vector3 = (1.0, 1.0, 1.0)
+    extensions: Extensions = {}
+
+
+class ScenePart(_Part):
+    nodes: list[Index] = []
+
+
+class TextureInfo(_Part):
+    index: Index
+    tex_coord: Index = 0
+    extensions: Extensions = {}
+
+
+class MetallicRoughness(_Part):
+    base_color_factor: tuple[Unit, Unit, Unit, Unit] = (1.0, 1.0, 1.0, 1.0)
+    base_color_texture: TextureInfo | None = None
+    metallic_factor: Unit = 1.0
+    roughness_factor: Unit = 1.0
+    metallic_roughness_texture: TextureInfo | None = None
+
+
+class MaterialPart(_Part):
+    name: str = ""
+    pbr_metallic_roughness: MetallicRoughness = MetallicRoughness()
+    normal_texture: TextureInfo | None = None
+    emissive_factor: tuple[Unit, Unit, Unit] = (0.0, 0.0, 0.0)
+    emissive_texture: TextureInfo | None = None
+    alpha_mode: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
+    alpha_cutoff: Annotated[float, Field(ge=0.0)] = 0.5
+    double_sided: bool = False
+    extensions: Extensions = {}
+
+
+class TexturePart(_Part):
+    sampler: Index | None = None
+    source: Index | None = None
+    extensions: Extensions = {}
+
+
+class Sampler(_Part):
+    wrap_s: Literal[33071, 33648, 10497] = 10497
+    wrap_t: Literal[33071, 33648, 10497] = 10497
+
+
+class ImagePart(_Part):
+    name: str = ""
+    uri: str | None = None
+    buffer_view: Index | None = None
+
+
+class Asset(_Part):
+    version: str
+
+
+class EmissiveStrength(_Part):
+    emissive_strength: Annotated[float, Field(ge=0.0)] = 1.0
+
+
+class TextureTransform(_Part):
+    offset: Vector2 = (0.0, 0.0)
+    scale: Vector2 = (1.0, 1.0)
+    rotation: float = 0.0
+    tex_coord: Index | None = None
+
+
+class Instancing(_Part):
+    attributes: dict[str, Index]
+
+
+class Spot(_Part):
+    inner_cone_angle: Annotated[float, Field(ge=0.0)] = 0.0
+    outer_cone_angle: Annotated[float, Field(gt=0.0, le=1.5707964)] = 0.7853981633974483
+
+
+class Light(_Part):
+    name: str = ""
+    type: Literal["point", "spot", "directional"]
+    color: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = (
+        1,
+        1,
+        1,
+    )
+    intensity: Annotated[float, Field(ge=0.0)] = 1.0
+    spot: Spot = Spot()
+
+
+class Lights(_Part):
+    lights: list[Light] = []
+
+
+class LightIndex(_Part):
+    light: Index
+
+
+class Document(_Part):
+    """A glTF 2.0 document, as far as it is read."""
+
+    asset: Asset
+    scene: Index | None = None
+    scenes: list[ScenePart] = []
+    nodes: list[Node] = []
+    meshes: list[MeshPart] = []
+    materials: list[MaterialPart] = []
+    accessors: list[Accessor] = []
+    buffer_views: list[BufferView] = []
+    buffers: list[Buffer] = []
+    images: list[ImagePart] = []
+    textures: list[TexturePart] = []
+    samplers: list[Sampler] = []
+    animations: list[Any] = []
+    extensions_used: list[str] = []
+    extensions_required: list[str] = []
+    extensions: Extensions = {}
+
+
+def parse_document(text: bytes, where: str) -> Document:
+    """The document of a file's JSON; InputError names the first field at fault."""
+    try:
+        return Document.model_validate_json(text)
+    except ValidationError as error:
+        raise _refusal(error, where) from None
+
+
+def parse_extension(model: type[P], content: dict[str, Any], where: str) -> P:
+    """An extension's object as `model`."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise _refusal(error, where) from None
+
+
+def pick(items: list[T], index: int, what: str, where: str) -> T:
+    """`items[index]`; InputError where the document names what it does not hold."""
+    if index >= len(items):
+        raise InputError(f"{what} {index} is named but there are {len(items)}", where=where, remedy="Export it again.")
+    return items[index]
+
+
+def _refusal(error: ValidationError, where: str) -> InputError:
+    first = error.errors()[0]
+    field = ".".join(str(part) for part in first["loc"]) or "the document"
+    return InputError(f"is not valid glTF 2.0: {field}: {first['msg']}", where=where, remedy="Export it again.")

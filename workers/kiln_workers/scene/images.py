@@ -1,0 +1,78 @@
+"""Decoding of PNG, JPEG, OpenEXR and Radiance HDR images from bytes with OpenImageIO.
+
+The format is told by the first bytes, not by the file's name, and only these four formats are ever given to a decoder.
+OpenImageIO's Python module opens files only, so the bytes pass through a temporary file whose suffix fits the format.
+Row 0 is the top of the picture.
+"""
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import OpenImageIO as oiio
+
+from kiln_schemas.errors import InputError, TooLarge
+
+MAX_SIDE: Final = 16384
+"""Pixels along a side, at most."""
+
+SIGNATURES: Final[Mapping[str, bytes]] = {
+    "png": b"\x89PNG\r\n\x1a\n",
+    "jpg": b"\xff\xd8\xff",
+    "exr": b"\x76\x2f\x31\x01",
+    "hdr": b"#?",
+}
+HDR_FORMATS: Final = frozenset({"exr", "hdr"})
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """An image and the format that it came in (`png`, `jpg`, `exr`, `hdr`)."""
+
+    pixels: npt.NDArray[np.uint8] | npt.NDArray[np.float32]  # [H, W, C]; 8 bits as they are, all else as float
+    format: str
+
+
+def image_format(data: bytes) -> str | None:
+    """The format that the first bytes tell, None for any other."""
+    return next((name for name, magic in SIGNATURES.items() if data.startswith(magic)), None)
+
+
+def decode_image(data: bytes, where: str) -> Decoded:
+    """Decode an image; InputError names `where` if it is of another format, damaged, or too large."""
+    kind = image_format(data)
+    if kind is None:
+        raise InputError(
+            "is neither PNG, JPEG, OpenEXR nor Radiance HDR", where=where, remedy="Convert it to one of these."
+        )
+    with tempfile.TemporaryDirectory(prefix="kiln-image-") as folder:
+        path = Path(folder) / f"image.{kind}"
+        path.write_bytes(data)
+        return Decoded(_read(path, kind, where), kind)
+
+
+def _read(path: Path, kind: str, where: str) -> npt.NDArray[np.uint8] | npt.NDArray[np.float32]:
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise InputError(f"cannot be decoded as {kind}: {oiio.geterror()}", where=where, remedy="Save it again.")
+    try:
+        spec = source.spec()
+        if spec.width > MAX_SIDE or spec.height > MAX_SIDE:
+            raise TooLarge(
+                f"has {spec.width} x {spec.height} pixels, at most {MAX_SIDE} a side are read",
+                where=where,
+                remedy="Make it smaller.",
+            )
+        if (spec.width, spec.height, spec.x, spec.y) != (spec.full_width, spec.full_height, spec.full_x, spec.full_y):
+            raise InputError("its data window is not its display window", where=where, remedy="Save it uncropped.")
+        narrow = kind in ("png", "jpg") and spec.format.basetype == oiio.UINT8
+        pixels = source.read_image(0, 0, 0, min(spec.nchannels, 4), oiio.UINT8 if narrow else oiio.FLOAT)
+        if pixels is None:
+            raise InputError(f"is damaged: {source.geterror()}", where=where, remedy="Save it again.")
+    finally:
+        source.close()
+    return np.ascontiguousarray(np.asarray(pixels).reshape(spec.height, spec.width, -1))

@@ -1,0 +1,56 @@
+"""One door for scenes: the reader is chosen by the entry's suffix, the environment is added, and the whole is checked.
+
+glTF and GLB are the main format; OBJ, PLY and Mitsuba XML become the same model.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from kiln_schemas.errors import InputError
+from kiln_schemas.tasks import EnvironmentRef
+from kiln_workers.scene.environment import load_environment
+from kiln_workers.scene.gltf import read_gltf
+from kiln_workers.scene.mitsuba_xml import read_mitsuba_xml
+from kiln_workers.scene.model import Scene
+from kiln_workers.scene.trimesh_files import read_obj, read_ply
+
+READERS: Final[Mapping[str, Callable[[Path, str], Scene]]] = {
+    ".gltf": read_gltf,
+    ".glb": read_gltf,
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".xml": read_mitsuba_xml,
+}
+
+
+def load_scene(folder: Path, entry: str, environment: EnvironmentRef | None = None) -> Scene:
+    """The scene `entry` of the bundle in `folder` under `environment`; InputError says what is wrong with it."""
+    reader = READERS.get(PurePosixPath(entry).suffix.lower())
+    if reader is None:
+        raise InputError(
+            f"'{PurePosixPath(entry).suffix}' is not a scene format that is read",
+            where=entry,
+            remedy=f"Use one of {', '.join(READERS)}.",
+        )
+    scene = reader(folder, entry)
+    if not scene.triangles:
+        raise InputError("has no faces", where=entry, remedy="Export at least one mesh with triangles of some area.")
+    if environment is None:
+        return scene
+    loaded, notes = load_environment(folder, environment)
+    if scene.environment is not None:
+        notes = [f"'{entry}': its own environment is replaced by '{environment.file}'.", *notes]
+    return replace(scene, environment=loaded, notes=(*scene.notes, *notes))
+
+
+def check_light(scene: Scene) -> Scene:
+    """The scene unchanged if anything in it emits; InputError otherwise (the prepare task asks this)."""
+    if not scene.has_light:
+        raise InputError(
+            "nothing in the scene emits light",
+            where="scene",
+            remedy="Add an environment (--env), an emissive material or a light.",
+        )
+    return scene
