@@ -1,0 +1,124 @@
+"""The store's layout: Zarr v3 metadata of its arrays and the attributes that make it understandable alone.
+
+One shard is one tile, so a tile is replaced by one atomic object write; one chunk is one texel's image, so a
+single texel can be read by a byte range. Radiance is stored uncompressed: path-traced fp16 noise does not compress.
+Format: Zarr v3 core, sharding_indexed (ZEP 2), crc32c on the shard's index and on every chunk.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from kiln_schemas import conventions
+from kiln_schemas.settings import Function
+
+_BYTES: Final = {"name": "bytes", "configuration": {"endian": "little"}}
+_CRC: Final = {"name": "crc32c"}
+_ZSTD: Final = {"name": "zstd", "configuration": {"level": 3, "checksum": False}}
+
+TEXEL_MAP_ARRAYS: Final[Mapping[str, tuple[str, int]]] = {
+    "state": ("uint8", 1),
+    "position": ("float32", 3),
+    "normal": ("float32", 3),
+    "alpha": ("float32", 1),
+}
+"""Per-texel arrays kept with the light fields: data type and channels."""
+
+CONVENTIONS: Final[Mapping[str, str]] = {
+    "units": "Positions in metres; radiance in scene units (linear Rec.709 RGB); irradiance in radiance times sr.",
+    "world": "Right-handed, +Y up (glTF 2.0).",
+    "texels": (
+        "Arrays are indexed [row, column, ...]; texel (row, column) is centred at u = (column + 1/2)/W, "
+        "v = (row + 1/2)/H with v downwards, as glTF. Texels without surface are absent chunks."
+    ),
+    "octahedral_map": (
+        "Images are indexed [row j, column i, channel] and cover the full sphere in WORLD space: pixel (i, j) covers "
+        "the square [i, i+1] x [j, j+1] / R; with x = 2(i + 1/2)/R - 1, y = 2(j + 1/2)/R - 1 and "
+        "p = (x, y, 1 - |x| - |y|), the direction is p/|p|, where for p.z < 0 first p.x -= sign(x) |p.z| and "
+        "p.y -= sign(y) |p.z|. Solid angle element: dx dy / |p|^3."
+    ),
+    "horizon": (
+        "Directions v with v . normal <= 0 carry nothing and count in no error; normal is the geometric normal."
+    ),
+    "light_field": (
+        "Mean incident radiance over each pixel. The directly seen environment is left out; emissive surfaces and the "
+        "environment's light reflected by the scene are in."
+    ),
+    "visibility": (
+        "Illumination-weighted environment visibility W_E (Currius et al. 2020, eq. 7) of the GGX lobe of `alpha`, "
+        "0 to 1 per colour channel."
+    ),
+    "irradiance": "Over the hemisphere of the texel's shading normal, direct and indirect, environment included.",
+    "exposure": (
+        "Values here are not exposure-normalised. The fit multiplies radiance by EXPOSURE_KEY / (mean luminance above "
+        "the horizons, solid-angle-weighted) and undoes it in the amplitudes; the factor is in the bake's manifest."
+    ),
+    "alpha": "GGX alpha = (glTF roughness)^2.",
+    "state": "0 gutter, 1 valid, 2 covered but inside geometry.",
+    "float16": "Values above 65504 were clamped to it.",
+}
+
+
+def group_document(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """The group's zarr.json."""
+    return {"zarr_format": 3, "node_type": "group", "attributes": dict(attributes)}
+
+
+def group_attributes(
+    shape: tuple[int, int], image_size: int, tile: int, functions: Sequence[Function], extra: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What the group says of itself: layout, conventions and what the caller adds (settings, scene hash, ...)."""
+    return {
+        **extra,
+        "format": "lightkiln.light-field",
+        "format_version": conventions.FORMAT_VERSION,
+        "resolution": list(shape),
+        "image_size": image_size,
+        "tile": tile,
+        "functions": [function.value for function in functions],
+        "exposure_key": conventions.EXPOSURE_KEY,
+        "conventions": dict(CONVENTIONS),
+    }
+
+
+def image_metadata(function: Function, shape: tuple[int, int], image_size: int, tile: int) -> dict[str, Any]:
+    """Array metadata of a light-field or visibility array [H, W, R, R, 3] float16."""
+    image = [image_size, image_size, 3]
+    inner = [_BYTES, _CRC] if function is Function.LIGHT_FIELD else [_BYTES, _ZSTD, _CRC]
+    codec = {
+        "name": "sharding_indexed",
+        "configuration": {
+            "chunk_shape": [1, 1, *image],
+            "codecs": inner,
+            "index_codecs": [_BYTES, _CRC],
+            "index_location": "end",
+        },
+    }
+    return _metadata("float16", [*shape, *image], [tile, tile, *image], [codec], ["row", "column", "y", "x", "rgb"])
+
+
+def irradiance_metadata(shape: tuple[int, int], tile: int) -> dict[str, Any]:
+    """Array metadata of the irradiance [H, W, 3] float32: one chunk a tile, which is one object."""
+    return _metadata("float32", [*shape, 3], [tile, tile, 3], [_BYTES, _CRC], ["row", "column", "rgb"])
+
+
+def texel_map_metadata(name: str, shape: tuple[int, int]) -> dict[str, Any]:
+    """Array metadata of one of TEXEL_MAP_ARRAYS."""
+    data_type, channels = TEXEL_MAP_ARRAYS[name]
+    tail, names = ([channels], ["xyz"]) if channels > 1 else ([], [])
+    chunk = [min(shape[0], 512), min(shape[1], 512), *tail]
+    return _metadata(data_type, [*shape, *tail], chunk, [_BYTES, _ZSTD, _CRC], ["row", "column", *names])
+
+
+def _metadata(
+    data_type: str, shape: list[int], chunk: list[int], codecs: list[dict[str, Any]], names: list[str]
+) -> dict[str, Any]:
+    if data_type == "uint8":
+        codecs = [{"name": "bytes"} if codec is _BYTES else codec for codec in codecs]
+    return {
+        "shape": shape,
+        "data_type": data_type,
+        "fill_value": 0,
+        "dimension_names": names,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
+        "codecs": codecs,
+    }
