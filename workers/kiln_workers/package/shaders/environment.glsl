@@ -1,0 +1,34 @@
+// Lookups in the preconvolved environment. GLSL ES 3.00; include after sg.glsl.
+//
+// environment_u.ktx2 is a 2D array of octahedral maps of U(o, alpha) = integral of D(h) L_E(i) di (Currius et al. 2020,
+// eq. 6), one layer for each alpha that manifest.json lists under textures.environment_u.ktx2.alphas; the integral is
+// not normalised. environment_ggx.ktx2 is a cube map whose mips hold n.l-weighted means of the environment under GGX
+// (Karis 2013), the mip of a perceptual roughness r being (mips - 1) r (2 - r).
+
+const int LK_MAX_U_LAYERS = 16;
+
+// Texture coordinates in [0, 1] of a direction in an octahedral map (Meyer et al. 2010): world space, lower half z < 0
+// folded outwards.
+vec2 lkOctahedral(vec3 direction) {
+  vec3 p = direction / (abs(direction.x) + abs(direction.y) + abs(direction.z));
+  vec2 fold = (1.0 - abs(p.yx)) * vec2(p.x < 0.0 ? -1.0 : 1.0, p.y < 0.0 ? -1.0 : 1.0);
+  return 0.5 + 0.5 * (p.z < 0.0 ? fold : p.xy);
+}
+
+// U(direction, alpha), linear between the two layers whose alphas (ascending) enclose it.
+vec3 lkEnvironmentU(sampler2DArray u, float alphas[LK_MAX_U_LAYERS], int count, vec3 direction, float alpha) {
+  vec2 at = lkOctahedral(direction);
+  int upper = 0;
+  while (upper < count - 1 && alphas[upper] < alpha) upper++;
+  int lower = max(upper - 1, 0);
+  float span = alphas[upper] - alphas[lower];
+  float t = span > 0.0 ? clamp((alpha - alphas[lower]) / span, 0.0, 1.0) : 0.0;
+  vec3 below = texture(u, vec3(at, float(lower))).rgb;
+  vec3 above = texture(u, vec3(at, float(upper))).rgb;
+  return mix(below, above, t);
+}
+
+// The mean of the environment under the GGX lobe about `direction`, for perceptual roughness.
+vec3 lkEnvironmentGgx(samplerCube ggx, float mips, vec3 direction, float roughness) {
+  return textureLod(ggx, direction, (mips - 1.0) * roughness * (2.0 - roughness)).rgb;
+}
