@@ -1,9 +1,9 @@
 """Choose the machine that renders: a CUDA GPU, or the CPU through a libLLVM that Dr.Jit can use.
 
-Dr.Jit loads libLLVM at run time and takes the first that it finds; with one older than 16 the process aborts on machines
-with AVX-512, where no Python code can catch it. So the version is read from file names and ELF headers, never by loading
-the library, and the newest is named to Dr.Jit in DRJIT_LIBLLVM_PATH before any LLVM variant is selected. What lacks is
-a `MachineLacks` with the package that mends it.
+Dr.Jit loads libLLVM at run time and takes the first that it finds; with one older than 16 the process aborts on
+machines with AVX-512, where no Python code can catch it. So the version is read from file names and ELF headers, never
+by loading the library, and the newest is named to Dr.Jit in DRJIT_LIBLLVM_PATH before any LLVM variant is selected.
+What lacks is a `MachineLacks` with the package that mends it.
 """
 
 import ctypes.util

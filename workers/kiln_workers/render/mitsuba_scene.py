@@ -1,0 +1,273 @@
+"""The parsed scene as a Mitsuba scene: what the path tracer traces, and what a reference render shows.
+
+Materials become `principled` (Burley 2012) with specular 0.5, that is F0 = 0.04, whose GGX alpha is roughness^2 as in
+glTF; its diffuse lobe is Disney's, not glTF's Lambert. The back of a single-sided material reflects nothing: it is the
+inside of a solid. The environment's rows are doubled, because Mitsuba puts the first row at the pole and `scene.model`
+half a row below it; on the doubled grid both agree at every row. A double-sided emitter becomes two sheets back to
+back. Spot lights fall off linearly in the angle between their cones, which glTF leaves open.
+"""
+
+from typing import Any, Final
+
+import numpy as np
+
+from kiln_workers.render import textures
+from kiln_workers.render.backend import select_variant
+from kiln_workers.scene.model import Environment, Float32, LightKind, Material, Mesh, PunctualLight, Scene
+
+MIN_ROUGHNESS: Final = 0.05
+"""Below this the GGX peak outgrows float32 and no sampler finds it; alpha 0.0025 is a mirror at any image size here."""
+
+SHEET_GAP: Final = 1e-6
+"""Distance between the two sheets of a double-sided emitter, as a fraction of the scene's diagonal."""
+
+
+def to_mitsuba(scene: Scene) -> Any:
+    """The `mi.Scene` of a parsed scene (variant: the one selected, else `select_variant()`'s choice)."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        select_variant()
+    from kiln_workers.render.emitters import register_emitters
+
+    register_emitters()
+    powers = _EmitterPowers(scene)
+    parts: dict[str, Any] = {"type": "scene"}
+    bsdfs: dict[int, Any] = {}
+    for number, mesh in enumerate(scene.meshes):
+        if not len(mesh.faces):
+            continue
+        material = scene.materials[mesh.material]
+        key = mesh.material if not _needs_uv_range(material) else -1 - number
+        if key not in bsdfs:
+            bsdfs[key] = mi.load_dict(_bsdf(scene, material, mesh.uv))
+        weight = powers.mesh_weight(mesh)
+        parts[f"mesh_{number}"] = _mesh(mesh, material, bsdfs[key], _emission(scene, material, mesh, weight))
+        if max(material.emission) > 0.0 and material.double_sided:
+            back = back_sheet(mesh, SHEET_GAP * scene_diagonal(scene))
+            parts[f"mesh_{number}_back"] = _mesh(back, material, bsdfs[key], _emission(scene, material, back, weight))
+    for number, light in enumerate(scene.lights):
+        parts[f"light_{number}"] = _light(light, powers.light_weight(light))
+    if scene.environment is not None:
+        parts["environment"] = _environment(scene.environment, powers.environment_weight())
+    return mi.load_dict(parts)
+
+
+def scene_bounds(scene: Scene) -> tuple[Float32, Float32]:
+    """Lower and upper corner [3] of all meshes; both zero in a scene without vertices."""
+    corners = [mesh.positions for mesh in scene.meshes if len(mesh.positions)]
+    if not corners:
+        return np.zeros(3, np.float32), np.zeros(3, np.float32)
+    low = np.min([points.min(axis=0) for points in corners], axis=0)
+    high = np.max([points.max(axis=0) for points in corners], axis=0)
+    return low.astype(np.float32), high.astype(np.float32)
+
+
+def scene_diagonal(scene: Scene) -> float:
+    """Length of the bounding box's diagonal in metres, at least 1e-6."""
+    low, high = scene_bounds(scene)
+    return max(float(np.linalg.norm(high.astype(np.float64) - low)), 1e-6)
+
+
+def back_sheet(mesh: Mesh, gap: float) -> Mesh:
+    """The mesh's faces turned over and moved `gap` metres behind it, each on vertices of its own."""
+    corners = mesh.positions[mesh.faces].astype(np.float64)  # [F, 3, 3]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
+    positions = (corners - gap * normal[:, None])[:, ::-1].reshape(-1, 3).astype(np.float32)
+    order = mesh.faces[:, ::-1].reshape(-1)
+    return Mesh(
+        name=f"{mesh.name} (back)",
+        positions=positions,
+        normals=-np.repeat(normal, 3, axis=0).astype(np.float32),
+        faces=np.arange(len(positions), dtype=np.int32).reshape(-1, 3),
+        material=mesh.material,
+        uv=None if mesh.uv is None else mesh.uv[order],
+    )
+
+
+class _EmitterPowers:
+    """Probabilities by which next-event estimation picks emitters: half by radiant power, half uniform.
+
+    Power alone would starve a dim lamp that is close; uniform alone wastes half the samples on small panels.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.radius = 0.5 * scene_diagonal(scene)
+        powers = [self._mesh(mesh) for mesh in scene.meshes if max(scene.materials[mesh.material].emission) > 0.0]
+        powers += [self._light(light) for light in scene.lights]
+        if scene.environment is not None:
+            powers.append(self._environment())
+        self.mean = sum(powers) / max(len(powers), 1)
+
+    def mesh_weight(self, mesh: Mesh) -> float:
+        return self._weight(self._mesh(mesh))
+
+    def light_weight(self, light: PunctualLight) -> float:
+        return self._weight(self._light(light))
+
+    def environment_weight(self) -> float:
+        return self._weight(self._environment())
+
+    def _weight(self, power: float) -> float:
+        return 0.5 + 0.5 * power / self.mean if self.mean > 0.0 else 1.0
+
+    def _mesh(self, mesh: Mesh) -> float:
+        corners = mesh.positions[mesh.faces].astype(np.float64)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = 0.5 * float(np.linalg.norm(cross, axis=-1).sum())
+        return float(np.mean(self.scene.materials[mesh.material].emission)) * area * np.pi
+
+    def _light(self, light: PunctualLight) -> float:
+        solid_angle = {
+            LightKind.POINT: 4.0 * np.pi,
+            LightKind.SPOT: 2.0 * np.pi * (1.0 - np.cos(light.outer_cone)),
+            LightKind.DIRECTIONAL: np.pi * self.radius**2,
+        }
+        return float(np.mean(light.intensity) * solid_angle[light.kind])
+
+    def _environment(self) -> float:
+        environment = self.scene.environment
+        if environment is None:
+            return 0.0
+        rows = np.sin(np.pi * (np.arange(len(environment.pixels)) + 0.5) / len(environment.pixels))
+        mean = float((environment.pixels.mean(axis=(1, 2)) * rows).sum() / rows.sum())
+        return environment.scale * mean * np.pi * 4.0 * np.pi * self.radius**2
+
+
+def _needs_uv_range(material: Material) -> bool:
+    used = (material.base_color_texture, material.metallic_roughness_texture, material.emission_texture)
+    return any(ref is not None and ref.wrap[0] != ref.wrap[1] for ref in used)
+
+
+def _mesh(mesh: Mesh, material: Material, bsdf: Any, emitter: Any | None) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    properties = mi.Properties()
+    properties["bsdf"] = bsdf
+    if emitter is not None:
+        properties["emitter"] = emitter
+    # Emitters are flat: Mitsuba converts areas to solid angles with the interpolated normal, which would be biased.
+    smooth = emitter is None
+    out = mi.Mesh(
+        mesh.name, len(mesh.positions), len(mesh.faces), properties, smooth, has_vertex_texcoords=mesh.uv is not None
+    )
+    parameters = mi.traverse(out)
+    parameters["vertex_positions"] = mi.Float(np.ravel(mesh.positions).astype(np.float32))
+    parameters["faces"] = mi.UInt32(np.ravel(mesh.faces).astype(np.uint32))
+    if smooth:
+        parameters["vertex_normals"] = mi.Float(np.ravel(mesh.normals).astype(np.float32))
+    if mesh.uv is not None:
+        parameters["vertex_texcoords"] = mi.Float(np.ravel(mesh.uv).astype(np.float32))
+    parameters.update()
+    dr.eval(parameters["vertex_positions"])
+    return out
+
+
+def _bsdf(scene: Scene, material: Material, uv: Float32 | None) -> dict[str, Any]:
+    surface: dict[str, Any] = {"type": "principled", "specular": 0.5, **_reflectance(scene, material, uv)}
+    if material.double_sided:
+        surface = {"type": "twosided", "bsdf": surface}
+    if material.alpha_cutoff is None:
+        return surface
+    return {"type": "mask", "bsdf": surface, "opacity": opacity(scene, material, uv)}
+
+
+def _reflectance(scene: Scene, material: Material, uv: Float32 | None) -> dict[str, Any]:
+    factor = np.clip(np.asarray(material.base_color[:3], np.float32), 0.0, 1.0)
+    out: dict[str, Any] = {"base_color": {"type": "rgb", "value": factor.tolist()}}
+    if material.base_color_texture is not None and uv is not None:
+        pixels = textures.linear_pixels(scene.images[material.base_color_texture.image])[..., :3] * factor
+        out["base_color"] = textures.bitmap(np.clip(pixels, 0.0, 1.0), material.base_color_texture, uv)
+    roughness = float(np.clip(material.roughness, MIN_ROUGHNESS, 1.0))
+    out |= {"roughness": roughness, "metallic": float(np.clip(material.metallic, 0.0, 1.0))}
+    if material.metallic_roughness_texture is not None and uv is not None:
+        reference = material.metallic_roughness_texture
+        pixels = textures.linear_pixels(scene.images[reference.image])
+        rough = np.clip(pixels[..., 1:2] * np.float32(material.roughness), MIN_ROUGHNESS, 1.0)
+        metal = np.clip(pixels[..., 2:3] * np.float32(material.metallic), 0.0, 1.0)
+        out["roughness"] = textures.bitmap(rough, reference, uv)
+        out["metallic"] = textures.bitmap(metal, reference, uv)
+    return out
+
+
+def opacity(scene: Scene, material: Material, uv: Float32 | None) -> Any:
+    """The alpha test as a Mitsuba texture of zeros and ones, or a number where no texture carries alpha."""
+    cutoff, factor = material.alpha_cutoff or 0.0, float(material.base_color[3])
+    reference = material.base_color_texture
+    if reference is None or uv is None:
+        return 1.0 if factor >= cutoff else 0.0
+    alpha = textures.linear_pixels(scene.images[reference.image])[..., 3] * np.float32(factor)
+    return textures.bitmap(textures.thresholded(alpha, cutoff, reference.wrap), reference, uv, nearest=True)
+
+
+def _emission(scene: Scene, material: Material, mesh: Mesh, weight: float) -> Any | None:
+    import mitsuba as mi
+
+    if max(material.emission) <= 0.0:
+        return None
+    radiance: dict[str, Any] = {"type": "rgb", "value": list(material.emission)}
+    textured = material.emission_texture is not None and mesh.uv is not None
+    if textured and material.emission_texture is not None:
+        pixels = textures.linear_pixels(scene.images[material.emission_texture.image])[..., :3]
+        factor = np.asarray(material.emission, np.float32)
+        radiance = textures.bitmap(np.maximum(pixels * factor, 0.0), material.emission_texture, mesh.uv)
+    covered = 1.0 if material.alpha_cutoff is None else opacity(scene, material, mesh.uv)
+    if covered == 0.0:
+        return None
+    if not textured and covered == 1.0:
+        return mi.load_dict({"type": "area", "radiance": radiance, "sampling_weight": weight})
+    emitter: dict[str, Any] = {"type": "kiln_area", "sampling_weight": weight}
+    # As objects: nested in a plugin written in Python, a plain colour would arrive as three numbers.
+    emitter["radiance"] = mi.load_dict(radiance)
+    if isinstance(covered, dict):
+        emitter["opacity"] = mi.load_dict(covered)
+    return mi.load_dict(emitter)
+
+
+def _light(light: PunctualLight, weight: float) -> dict[str, Any]:
+    import mitsuba as mi
+
+    intensity = {"type": "rgb", "value": list(light.intensity)}
+    if light.kind is LightKind.DIRECTIONAL:
+        direction = list(light.direction)
+        return {"type": "directional", "direction": direction, "irradiance": intensity, "sampling_weight": weight}
+    if light.kind is LightKind.POINT:
+        return {"type": "point", "position": list(light.position), "intensity": intensity, "sampling_weight": weight}
+    origin, direction = np.asarray(light.position, np.float64), np.asarray(light.direction, np.float64)
+    up = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    outer = float(np.degrees(light.outer_cone))
+    return {
+        "type": "spot",
+        "to_world": mi.ScalarTransform4f().look_at(
+            origin=origin.tolist(), target=(origin + direction).tolist(), up=up.tolist()
+        ),
+        "intensity": intensity,
+        "cutoff_angle": outer,
+        "beam_width": min(float(np.degrees(light.inner_cone)), 0.999 * outer),
+        "sampling_weight": weight,
+    }
+
+
+def _environment(environment: Environment, weight: float) -> dict[str, Any]:
+    import mitsuba as mi
+
+    turn = mi.ScalarTransform4f().rotate([0.0, 1.0, 0.0], environment.rotation_deg)
+    return {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(doubled_rows(environment.pixels)),
+        "scale": environment.scale,
+        "to_world": turn,
+        "sampling_weight": weight,
+    }
+
+
+def doubled_rows(pixels: Float32) -> Float32:
+    """Rows at v = k / 2H, k = 0 ... 2H [2H + 1, W, 3]: odd ones are the image's own, even ones the mean around them."""
+    padded = np.concatenate([pixels[:1], pixels, pixels[-1:]]).astype(np.float32)
+    out = np.empty((2 * len(pixels) + 1, *pixels.shape[1:]), np.float32)
+    out[1::2] = pixels
+    out[0::2] = 0.5 * (padded[:-1] + padded[1:])
+    return out

@@ -1,0 +1,111 @@
+"""glTF textures as Mitsuba bitmaps: linear values, factors multiplied in, wrap modes, KHR_texture_transform.
+
+Mitsuba's `bitmap` given a tensor has its first row at v = 0, as glTF has it, so nothing is flipped. It knows one wrap
+mode for both axes; where a glTF sampler has two, the image is unrolled over the range of coordinates that is in use.
+KHR_texture_transform scales, then rotates counter-clockwise as seen on the image (v down), then offsets:
+(u', v') = offset + (cos r u + sin r v, -sin r u + cos r v) with (u, v) scaled.
+"""
+
+import math
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from kiln_schemas.errors import TooLarge
+
+from kiln_workers.scene.model import Float32, Image, TextureRef
+
+Floats = npt.NDArray[np.float64]
+
+LARGEST_UNROLLED: Final = 1 << 26
+"""Pixels of an image that is unrolled because its two wrap modes differ."""
+
+OPACITY_OVERSAMPLING: Final = 4
+"""An alpha-tested texture is magnified by this factor before the test, so that its edges are not blocky."""
+
+
+def linear_pixels(image: Image) -> Float32:
+    """The image as linear float32 RGBA [H, W, 4]; grey is spread over RGB, absent alpha is 1."""
+    values = image.pixels.astype(np.float32)
+    if image.pixels.dtype == np.uint8:
+        values /= np.float32(255.0)
+    channels = values.shape[-1]
+    rgb = values[..., :1].repeat(3, axis=-1) if channels <= 2 else values[..., :3]
+    if image.srgb:
+        # IEC 61966-2-1.
+        rgb = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    alpha = values[..., -1:] if channels in (2, 4) else np.ones_like(values[..., :1])
+    return np.concatenate([rgb, alpha], axis=-1).astype(np.float32)
+
+
+def uv_matrix(reference: TextureRef) -> Floats:
+    """KHR_texture_transform as a 3 x 3 matrix on (u, v, 1)."""
+    cosine, sine = math.cos(reference.rotation), math.sin(reference.rotation)
+    scale_u, scale_v = reference.scale
+    return np.array(
+        [
+            [cosine * scale_u, sine * scale_v, reference.offset[0]],
+            [-sine * scale_u, cosine * scale_v, reference.offset[1]],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def bitmap(pixels: Float32, reference: TextureRef, uv: Float32 | None, nearest: bool = False) -> dict[str, Any]:
+    """A Mitsuba `bitmap` of linear `pixels` [H, W, 1 or 3] as `reference` looks it up for coordinates `uv` [V, 2]."""
+    import mitsuba as mi
+
+    matrix = uv_matrix(reference)
+    wrap = reference.wrap[0]
+    if reference.wrap[0] != reference.wrap[1]:
+        pixels, window = _unrolled(pixels, reference, matrix, uv)
+        matrix, wrap = window @ matrix, "clamp"
+    return {
+        "type": "bitmap",
+        "data": mi.TensorXf(np.ascontiguousarray(pixels, dtype=np.float32)),
+        "raw": True,
+        "wrap_mode": wrap,
+        "filter_type": "nearest" if nearest else "bilinear",
+        "to_uv": mi.ScalarTransform3f(matrix),
+    }
+
+
+def thresholded(alpha: Float32, cutoff: float, wrap: tuple[str, str]) -> Float32:
+    """glTF's alpha test of a magnified image: 1 where the bilinear alpha [H, W] >= cutoff, else 0; [4H, 4W, 1]."""
+    for axis, mode in ((0, wrap[1]), (1, wrap[0])):
+        size = alpha.shape[axis]
+        position = (np.arange(size * OPACITY_OVERSAMPLING) + 0.5) / OPACITY_OVERSAMPLING - 0.5
+        lower = np.floor(position).astype(np.int64)
+        weight = np.expand_dims((position - lower).astype(np.float32), 1 - axis)
+        first, second = (np.take(alpha, _wrapped(lower + k, size, mode), axis=axis) for k in (0, 1))
+        alpha = first * (1.0 - weight) + second * weight
+    return (alpha >= cutoff).astype(np.float32)[..., None]
+
+
+def _unrolled(pixels: Float32, reference: TextureRef, matrix: Floats, uv: Float32 | None) -> tuple[Float32, Floats]:
+    """The image repeated over the used range of both axes, and the matrix from old to new coordinates."""
+    points = np.zeros((1, 2)) if uv is None else uv.astype(np.float64)
+    used = points @ matrix[:2, :2].T + matrix[:2, 2]
+    low, high = np.floor(used.min(axis=0)).astype(int), np.ceil(used.max(axis=0)).astype(int)
+    high = np.maximum(high, low + 1)
+    height, width = pixels.shape[:2]
+    if (high - low).prod() * height * width > LARGEST_UNROLLED:
+        raise TooLarge(
+            f"texture coordinates run over {' x '.join(map(str, high - low))} repetitions with two wrap modes",
+            where=f"image {reference.image}",
+            remedy="Use one wrap mode for both axes, or keep the coordinates near [0, 1].",
+        )
+    columns = _wrapped(np.arange(low[0] * width, high[0] * width), width, reference.wrap[0])
+    rows = _wrapped(np.arange(low[1] * height, high[1] * height), height, reference.wrap[1])
+    span = (high - low).astype(np.float64)
+    window = np.array([[1 / span[0], 0.0, -low[0] / span[0]], [0.0, 1 / span[1], -low[1] / span[1]], [0.0, 0.0, 1.0]])
+    return pixels[rows[:, None], columns[None, :]], window
+
+
+def _wrapped(index: npt.NDArray[np.int64], size: int, mode: str) -> npt.NDArray[np.int64]:
+    if mode == "clamp":
+        return np.clip(index, 0, size - 1)
+    if mode == "mirror":
+        folded = index % (2 * size)
+        return np.where(folded < size, folded, 2 * size - 1 - folded)
+    return index % size
