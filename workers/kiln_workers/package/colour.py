@@ -9,8 +9,11 @@ Floats = npt.NDArray[np.floating]
 UInt8 = npt.NDArray[np.uint8]
 
 # Viridis (van der Walt and Smith 2015), every 16th of its 256 entries and the last, as sRGB hexadecimal.
-_VIRIDIS: Final = "440154 48186a 472d7b 424086 3b528b 33638d 2c728e 26828e 21918c 1fa088 28ae80 3fbc73 5ec962 84d44b addc30 d8e219 fde725"
-VIRIDIS: Final = np.array([[int(c[i : i + 2], 16) for i in (0, 2, 4)] for c in _VIRIDIS.split()], np.float64)
+_VIRIDIS: Final = (
+    *("440154", "48186a", "472d7b", "424086", "3b528b", "33638d", "2c728e", "26828e", "21918c"),
+    *("1fa088", "28ae80", "3fbc73", "5ec962", "84d44b", "addc30", "d8e219", "fde725"),
+)
+VIRIDIS: Final = np.array([[int(c[i : i + 2], 16) for i in (0, 2, 4)] for c in _VIRIDIS], np.float64)
 
 
 def srgb_encode(linear: Floats) -> Floats:

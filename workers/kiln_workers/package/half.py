@@ -48,3 +48,9 @@ def layers_to_lobes(layers: Half) -> Float32:
     """The inverse of `lobes_to_layers`: lobes [H, W, N, 7] as the textures hold them, in float32."""
     pairs = layers.reshape(-1, LAYERS_PER_LOBE, *layers.shape[1:]).astype(np.float32)
     return np.ascontiguousarray(np.moveaxis(np.concatenate([pairs[:, 0], pairs[:, 1, ..., :3]], axis=-1), 0, 2))
+
+
+def as_stored(lobes: Float32) -> Float32:
+    """Finite lobes [..., N, 7] as the texture will hold them: unit axes, rounded and clamped to fp16, in float32."""
+    values, _ = to_half(normalise_axes(lobes))
+    return values.astype(np.float32)

@@ -1,0 +1,283 @@
+"""Builds a package from arrays: the files of DESIGN's "What comes out", and last of all the manifest that names them.
+
+A pure library: it knows no queue, no store and no network. Every file is written atomically; `manifest.json` comes last
+(and an old one goes first), so a folder with a manifest is a whole package.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from kiln_schemas import __version__
+from kiln_schemas.conventions import (
+    ENVIRONMENT_GGX_KTX2,
+    ENVIRONMENT_U_KTX2,
+    FORMAT_VERSION,
+    IRRADIANCE_EXR,
+    IRRADIANCE_KTX2,
+    LIGHT_FIELD_KTX2,
+    MANIFEST_JSON,
+    REPORT_HTML,
+    SCENE_GLB,
+    VISIBILITY_KTX2,
+)
+from kiln_schemas.errors import InternalError
+from kiln_schemas.manifest import Manifest, ManifestMetrics
+from kiln_schemas.settings import Function
+from kiln_schemas.tasks import Artifact, FitMetrics, PackagePayload
+
+from kiln_workers.package import exr, ktx2, report, shaders
+from kiln_workers.package.dilate import Fill, plan_fill
+from kiln_workers.package.files import artifact, write_bytes
+from kiln_workers.package.glb import encode_glb
+from kiln_workers.package.half import lobes_to_layers, to_half
+from kiln_workers.package.preview import PackagePreview
+from kiln_workers.scene.model import Scene
+
+Float32 = npt.NDArray[np.float32]
+Bools = npt.NDArray[np.bool_]
+
+LOBE_FILES: Final = {Function.LIGHT_FIELD: LIGHT_FIELD_KTX2, Function.VISIBILITY: VISIBILITY_KTX2}
+TEXEL_VALID: Final = 1
+GGX_LOD: Final = "(mips - 1) * r * (2 - r)"
+
+
+class TexelMapLike(Protocol):
+    """What the packager reads of a texel map (`kiln_workers.scene.texels.TexelMap`); arrays [H, W]."""
+
+    @property
+    def state(self) -> npt.NDArray[np.uint8]: ...
+    @property
+    def texel_size(self) -> Float32: ...
+    @property
+    def chart(self) -> npt.NDArray[np.int32]: ...
+
+
+@dataclass(frozen=True)
+class LobeMap:
+    """The lobes of one function over the light map."""
+
+    lobes: Float32  # [H, W, N, 7]; anything outside `mask`
+    mask: Bools  # [H, W] texels that have lobes
+
+
+@dataclass(frozen=True)
+class EnvironmentTextures:
+    """The preconvolved environment (`kiln_workers.render.environment`)."""
+
+    ggx_mips: Sequence[Float32]
+    """Per mip [6, S, S, 3], largest first, faces +X -X +Y -Y +Z -Z with OpenGL's face orientations."""
+    u_layers: Float32
+    """[A, R, R, 3] octahedral maps of U(direction, alpha)."""
+    u_alphas: Sequence[float]
+    """Ascending alpha of each layer."""
+    u_normalised: bool
+    """Whether U was divided by the integral of D(h); the paper's is not."""
+
+
+@dataclass(frozen=True)
+class PackageInput:
+    """Everything that a package is made of, as arrays."""
+
+    payload: PackagePayload
+    scene: Scene
+    texel_map: TexelMapLike
+    irradiance: Float32  # [H, W, 3] W/m^2; anything outside valid texels
+    lobes: Mapping[Function, LobeMap]
+    metrics: Mapping[Function, FitMetrics]
+    """Errors of the lobes as stored (`half.as_stored`), for each function of `lobes`."""
+    preview: PackagePreview
+    environment: EnvironmentTextures | None
+    stage_seconds: Mapping[str, float]
+    versions: Mapping[str, str]
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    supercompress: bool = False
+    """Zstandard inside the lobe textures; engines that cannot inflate need plain files."""
+
+
+@dataclass
+class _Package:
+    """The folder being filled."""
+
+    folder: Path
+    given: PackageInput
+    files: list[Artifact] = field(default_factory=list)
+    textures: dict[str, dict[str, Any]] = field(default_factory=dict)
+    clamped: int = 0
+
+    def add(self, name: str) -> None:
+        self.files.append(artifact(self.folder, name))
+
+    def add_texture(self, name: str, texture: ktx2.Texture, description: Mapping[str, Any]) -> None:
+        """Write a KTX2 file and describe it; what is described goes into the file's own metadata too."""
+        compress = self.given.supercompress and name in LOBE_FILES.values()
+        ktx2.write(self.folder / name, texture, supercompress=compress)
+        self.textures[name] = {
+            "width": texture.width,
+            "height": texture.height,
+            "layers": texture.layers,
+            "faces": texture.faces,
+            "mips": len(texture.levels),
+            "format": "R16G16B16A16_SFLOAT",
+            "supercompression": "zstd" if compress else "none",
+            **description,
+        }
+        self.add(name)
+
+    def half(self, values: Float32) -> npt.NDArray[np.float16]:
+        """RGB values [..., 3] as RGBA halves with alpha 1, clamped values counted."""
+        rgb, clamped = to_half(values)
+        self.clamped += clamped
+        return np.concatenate([rgb, np.ones((*rgb.shape[:-1], 1), np.float16)], axis=-1)
+
+
+def build_package(folder: Path, given: PackageInput) -> list[Artifact]:
+    """Write the whole package into `folder`; every file of it, the manifest last.
+
+    Raises MachineLacks where the disk refuses, InternalError where the arrays contradict each other.
+    """
+    _check(given)
+    package = _Package(folder, given)
+    (folder / MANIFEST_JSON).unlink(missing_ok=True)
+    valid = given.texel_map.state == TEXEL_VALID
+    for function, lobe_map in given.lobes.items():
+        _write_lobes(package, function, lobe_map, plan_fill(lobe_map.mask, given.texel_map.chart))
+    irradiance = plan_fill(valid, given.texel_map.chart).smooth(given.irradiance)
+    _write_irradiance(package, irradiance)
+    if given.environment is not None:
+        _write_environment(package, given.environment)
+    write_bytes(folder / SCENE_GLB, encode_glb(given.scene))
+    package.add(SCENE_GLB)
+    for name, text in shaders.sources().items():
+        write_bytes(folder / "shaders" / name, text.encode("utf-8"))
+        package.add(f"shaders/{name}")
+
+    # The report shows the manifest as it stands without the report; the final manifest then names the report as well.
+    shown = report.ReportInput(_manifest(package), given.payload.fits, given.preview, irradiance, valid)
+    write_bytes(folder / REPORT_HTML, report.render(shown))
+    package.add(REPORT_HTML)
+    manifest = _manifest(package).model_dump_json(indent=2) + "\n"
+    write_bytes(folder / MANIFEST_JSON, manifest.encode("utf-8"))
+    return [*package.files, artifact(folder, MANIFEST_JSON)]
+
+
+def _check(given: PackageInput) -> None:
+    """Arrays that contradict each other are a defect of the caller; say which before anything is written."""
+    shape = given.texel_map.state.shape
+    if given.irradiance.shape != (*shape, 3):
+        raise InternalError(f"irradiance is {given.irradiance.shape}, the light map {shape}", where="package")
+    fitted = {fit.function for fit in given.payload.fits}
+    for function, lobe_map in given.lobes.items():
+        if lobe_map.lobes.shape[:2] != shape or lobe_map.mask.shape != shape:
+            raise InternalError(f"lobes are {lobe_map.lobes.shape}, the light map {shape}", where=str(function))
+        if function not in given.metrics or function not in fitted:
+            raise InternalError("lobes without metrics or without a fit", where=str(function))
+        if not np.isfinite(lobe_map.lobes[lobe_map.mask]).all():
+            raise InternalError("lobes that are not finite", where=str(function))
+    if not np.isfinite(given.irradiance[given.texel_map.state == TEXEL_VALID]).all():
+        raise InternalError("irradiance that is not finite", where="package")
+
+
+def _write_lobes(package: _Package, function: Function, lobe_map: LobeMap, fill: Fill) -> None:
+    layers, clamped = lobes_to_layers(fill.nearest(lobe_map.lobes))
+    package.clamped += clamped
+    count = lobe_map.lobes.shape[2]
+    metadata = {
+        "lightkiln.function": str(function),
+        "lightkiln.lobes": str(count),
+        "lightkiln.layout": "layer 2k: axis.xyz, sharpness; layer 2k+1: amplitude.rgb, 0",
+    }
+    description = {
+        "function": str(function),
+        "lobes": count,
+        "channels": {"even_layers": ["axis.x", "axis.y", "axis.z", "sharpness"], "odd_layers": ["r", "g", "b", "0"]},
+    }
+    package.add_texture(LOBE_FILES[function], ktx2.texture_array(layers, metadata), description)
+
+
+def _write_irradiance(package: _Package, irradiance: Float32) -> None:
+    unit = "W/m^2, linear Rec.709"
+    exr.write_rgb(package.folder / IRRADIANCE_EXR, irradiance, comments=f"irradiance, {unit}")
+    package.add(IRRADIANCE_EXR)
+    texture = ktx2.texture_2d(package.half(irradiance), {"lightkiln.unit": unit})
+    package.add_texture(IRRADIANCE_KTX2, texture, {"channels": ["r", "g", "b", "1"], "unit": unit})
+
+
+def _write_environment(package: _Package, environment: EnvironmentTextures) -> None:
+    mips = [package.half(mip) for mip in environment.ggx_mips]
+    cube = ktx2.texture_cube(mips, {"lightkiln.lod": GGX_LOD})
+    package.add_texture(
+        ENVIRONMENT_GGX_KTX2,
+        cube,
+        {"channels": ["r", "g", "b", "1"], "lod": GGX_LOD, "weighting": "n.l", "normalised": True},
+    )
+    alphas = [float(alpha) for alpha in environment.u_alphas]
+    metadata = {
+        "lightkiln.alphas": " ".join(f"{alpha:.6g}" for alpha in alphas),
+        "lightkiln.normalised": str(environment.u_normalised).lower(),
+        "lightkiln.projection": "octahedral",
+    }
+    description = {
+        "channels": ["r", "g", "b", "1"],
+        "alphas": alphas,
+        "normalised": environment.u_normalised,
+        "projection": "octahedral",
+    }
+    layers = package.half(environment.u_layers)
+    package.add_texture(ENVIRONMENT_U_KTX2, ktx2.texture_array(layers, metadata), description)
+
+
+def _manifest(package: _Package) -> Manifest:
+    given, payload = package.given, package.given.payload
+    return Manifest(
+        format_version=FORMAT_VERSION,
+        generator=f"lightkiln {__version__}",
+        job_id=payload.job_id,
+        job_name=payload.job_name,
+        settings=payload.settings,
+        scene_hash=payload.prepare.scene_hash,
+        inputs=dict(payload.bundle.files),
+        seeds={"settings": payload.settings.seed},
+        exposure={str(fit.function): fit.exposure for fit in payload.fits if fit.function in given.lobes},
+        metrics=ManifestMetrics(
+            light_field=given.metrics.get(Function.LIGHT_FIELD), visibility=given.metrics.get(Function.VISIBILITY)
+        ),
+        left_out=_left_out(given),
+        textures=package.textures,
+        lightmap=_lightmap(given.texel_map),
+        stage_seconds={name: round(seconds, 3) for name, seconds in given.stage_seconds.items()},
+        overflows=sum(render.overflows for render in payload.renders) + package.clamped,
+        versions=dict(given.versions),
+        notes=payload.prepare.notes,
+        files=tuple(package.files),
+    )
+
+
+def _left_out(given: PackageInput) -> dict[str, str]:
+    """What a package could have but this one has not, each with its reason; the caller's reasons come first."""
+    out = dict(given.left_out)
+    reason = "the scene has no environment" if not given.payload.prepare.has_environment else "it was not baked"
+    for function in Function:
+        if function not in given.lobes:
+            out.setdefault(str(function), reason)
+    if given.environment is None:
+        for name in (ENVIRONMENT_GGX_KTX2, ENVIRONMENT_U_KTX2):
+            out.setdefault(name, reason)
+    return out
+
+
+def _lightmap(texel_map: TexelMapLike) -> dict[str, Any]:
+    state, chart = texel_map.state, texel_map.chart
+    covered, valid = state != 0, state == TEXEL_VALID
+    return {
+        "width": int(state.shape[1]),
+        "height": int(state.shape[0]),
+        "covered": int(covered.sum()),
+        "valid": int(valid.sum()),
+        "invalid": int((covered & ~valid).sum()),
+        "charts": int(np.unique(chart[chart >= 0]).size),
+        "worst_texel_size_m": float(texel_map.texel_size[covered].max()),
+    }
