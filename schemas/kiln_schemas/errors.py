@@ -2,7 +2,8 @@
 
     KilnError
     |-- InputError          the scene, a file, a field or a setting is wrong (422, exit 3)
-    |   `-- TooLarge        a size or count is over its bound (413, exit 3)
+    |   |-- TooLarge        a size or count is over its bound (413, exit 3)
+    |   `-- Truncated       an upload ended early (400, exit 3)
     |-- AuthError           no token, or a wrong one (401, exit 6)
     |-- Forbidden           the token lacks the scope (403, exit 6)
     |-- NotFound            no such job, task, blob or artifact (404, exit 3)
@@ -40,8 +41,10 @@ class Problem(Contract):
 
     def sentence(self) -> str:
         """Place, cause and remedy as one line for people."""
-        parts = [f"{self.where}: {self.detail}" if self.where else self.detail, self.remedy or ""]
-        return " ".join(p for p in parts if p)
+        cause = f"{self.where}: {self.detail}" if self.where else self.detail
+        if not self.remedy:
+            return cause
+        return f"{cause} {self.remedy}" if cause.endswith((".", "!", "?")) else f"{cause}. {self.remedy}"
 
 
 class KilnError(Exception):
@@ -88,6 +91,10 @@ class InputError(KilnError):
 
 class TooLarge(InputError):
     code, title, status = "too-large", "A size or count is over its bound", 413
+
+
+class Truncated(InputError):
+    code, title, status = "truncated", "The upload ended early", 400
 
 
 class AuthError(KilnError):

@@ -1,8 +1,8 @@
 """HTTP between a worker and its coordinator, patient with a coordinator that is away.
 
-A coordinator may be killed and restarted at any moment and no finished work may be lost by it, so calls are repeated with
-growing pauses while it does not answer; every call is one that may be repeated (claims are fenced by attempts, commits
-of the same attempt are idempotent, blobs are addressed by their content). What it answers as
+A coordinator may be killed and restarted at any moment and no finished work may be lost by it, so calls are repeated
+with growing pauses while it does not answer; every call is one that may be repeated (claims are fenced by attempts,
+commits of the same attempt are idempotent, blobs are addressed by their content). What it answers as
 `application/problem+json` is raised as the exception of that code (`kiln_schemas.errors`).
 """
 
@@ -44,7 +44,7 @@ AWAY: Final = frozenset({502, 503, 504})
 
 
 class CoordinatorClient:
-    """The worker routes and the blobs of one coordinator. `stop` ends all waiting; `on_wait` is told once per outage."""
+    """The worker routes and the blobs of one coordinator. `stop` ends waiting; `on_wait` hears of each outage once."""
 
     def __init__(
         self,

@@ -1,9 +1,9 @@
 """What a worker's parent and its child process say to each other: one JSON object a line, over pipes.
 
 The parent writes `Setup` once and then a `Work` per task (or `Stop`) to the child's standard input; the child answers
-`Ready` once and then any number of `Report`s and one `Done` or `Failed` per task on what was its standard output when it
-started. The child then points its standard output at its standard error, so what libraries print becomes log lines and
-never corrupts the protocol.
+`Ready` once and then any number of `Report`s and one `Done` or `Failed` per task on what was its standard output when
+it started. The child then points its standard output at its standard error, so what libraries print becomes log lines
+and never corrupts the protocol.
 """
 
 from typing import Annotated, Final, Literal
@@ -19,7 +19,6 @@ class Setup(Contract):
     """Parent to child, first line: everything that stays the same between tasks."""
 
     say: Literal["setup"] = "setup"
-    parent_pid: int
     url: str
     token: str
     kinds: tuple[TaskKind, ...]

@@ -1,0 +1,168 @@
+"""`python -m kiln_workers worker|doctor|examples`: the worker's commands, without the coordinator's code.
+
+The package's `lightkiln` command runs these as subprocesses; a farm node that has only `lightkiln[worker]` installed
+can run them directly. Exit codes are those of `kiln_schemas.errors`, and 2 for wrong usage.
+"""
+
+import argparse
+import json
+import os
+import platform
+import secrets
+import sys
+import tempfile
+import traceback
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from kiln_schemas.errors import AuthError, InputError, InternalError, KilnError, MachineLacks
+from kiln_schemas.tasks import TaskKind
+from kiln_workers.runner.machine import claim_folder, cores, default_memory_bytes, parse_size
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; its exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        code: int = options.command(options)
+        return code
+    except KilnError as error:
+        return _tell(error, options.json)
+    except Exception:
+        return _tell(_defect(), options.json)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m kiln_workers", description="Work for a lightkiln coordinator.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    worker = commands.add_parser("worker", help="claim tasks and run them until told to stop")
+    worker.add_argument("--url", default=os.environ.get("LIGHTKILN_URL"), help="coordinator; or LIGHTKILN_URL")
+    worker.add_argument("--token", default=os.environ.get("LIGHTKILN_TOKEN"), help="or LIGHTKILN_TOKEN")
+    worker.add_argument("--token-file", type=Path, help="file that holds the token")
+    worker.add_argument("--kinds", default=",".join(TaskKind), help="kinds of tasks to take, separated by commas")
+    worker.add_argument("--memory", help="main memory to use, e.g. 4GiB")
+    worker.add_argument("--threads", type=int, help="cores to use; all by default")
+    worker.add_argument("--name", help="as the dashboard shows it; host name and process by default")
+    worker.add_argument("--scratch", type=Path, help="folder for temporary files and the blob cache")
+    worker.add_argument("--json", action="store_true", help="one JSON object a line on standard output")
+    worker.set_defaults(command=_worker)
+
+    doctor = commands.add_parser("doctor", help="say what this machine can do as a worker")
+    doctor.add_argument("--json", action="store_true", help="a JSON array of checks")
+    doctor.set_defaults(command=_doctor)
+
+    examples = commands.add_parser("examples", help="write the example scenes")
+    action = examples.add_subparsers(required=True, metavar="ACTION")
+    write = action.add_parser("write", help="write them as GLB and EXR")
+    write.add_argument("folder", type=Path)
+    write.add_argument("--json", action="store_true", help="a JSON object with the files' paths")
+    write.set_defaults(command=_examples)
+    return parser
+
+
+def _worker(options: argparse.Namespace) -> int:
+    from kiln_workers.runner.parent import Worker, WorkerOptions
+
+    if not options.url:
+        raise InputError("no coordinator is named", where="--url", remedy="Pass --url or set LIGHTKILN_URL.")
+    token, kinds, threads = _token(options), _kinds(options.kinds), options.threads or cores()
+    if threads < 1:
+        raise InputError(f"{threads} threads are refused", where="--threads", remedy="Give 1 or more.")
+    memory = parse_size(options.memory) if options.memory else default_memory_bytes()
+    folder, lock = claim_folder(options.scratch)
+    announce = _print_json if options.json else _print_line
+    with lock:
+        Worker(
+            WorkerOptions(
+                url=options.url,
+                token=token,
+                name=options.name or f"{platform.node()}-{os.getpid()}",
+                kinds=kinds,
+                memory_bytes=memory,
+                threads=threads,
+                folder=folder,
+            ),
+            announce,
+        ).run()
+    return 0
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from kiln_workers.runner.doctor import examine
+
+    checks = examine()
+    if options.json:
+        print(json.dumps([check.model_dump() for check in checks]))
+    else:
+        for check in checks:
+            print(f"{check.status:4} {check.name}: {check.detail}{f'. {check.remedy}' if check.remedy else ''}")
+    return MachineLacks.exit_code if any(check.status == "fail" for check in checks) else 0
+
+
+def _examples(options: argparse.Namespace) -> int:
+    from kiln_workers.scene.examples import write_examples
+
+    try:
+        options.folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"the folder cannot be made: {error.strerror}", where=str(options.folder)) from None
+    files = [str(path) for path in write_examples(options.folder)]
+    print(json.dumps({"files": files}) if options.json else "\n".join(files))
+    return 0
+
+
+def _token(options: argparse.Namespace) -> str:
+    if options.token_file is not None:
+        try:
+            token: str = options.token_file.read_text().strip()
+        except OSError as error:
+            raise InputError(f"cannot be read: {error.strerror}", where=str(options.token_file)) from None
+    else:
+        token = options.token or ""
+    if not token:
+        raise AuthError(
+            "no token is given", where="--token", remedy="Pass --token or --token-file, or set LIGHTKILN_TOKEN."
+        )
+    return token
+
+
+def _kinds(text: str) -> tuple[TaskKind, ...]:
+    try:
+        return tuple(dict.fromkeys(TaskKind(part.strip()) for part in text.split(",")))
+    except ValueError:
+        raise InputError(
+            f"'{text}' is refused", where="--kinds", remedy=f"Choose some of {','.join(TaskKind)}."
+        ) from None
+
+
+def _print_json(event: str, detail: dict[str, Any]) -> None:
+    print(json.dumps({"event": event, **detail}), flush=True)
+
+
+def _print_line(event: str, detail: dict[str, Any]) -> None:
+    words = detail["line"] if event == "log" else f"{event} {' '.join(f'{k}={v}' for k, v in detail.items())}"
+    print(f"{datetime.now():%H:%M:%S} {words}", file=sys.stderr, flush=True)
+
+
+def _defect() -> InternalError:
+    """Write the traceback to a file and name that to the user."""
+    with tempfile.NamedTemporaryFile(
+        "w", prefix=f"lightkiln-defect-{secrets.token_hex(4)}-", suffix=".log", delete=False
+    ) as file:
+        traceback.print_exc(file=file)
+    return InternalError("a defect in lightkiln stopped the worker", remedy=f"Please report it with {file.name}.")
+
+
+def _tell(error: KilnError, as_json: bool) -> int:
+    if as_json:
+        print(json.dumps(error.problem().model_dump()), flush=True)
+    else:
+        print(f"error: {error}", file=sys.stderr)
+    return error.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
