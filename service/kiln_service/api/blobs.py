@@ -1,0 +1,55 @@
+"""Routes of blobs: ask which are missing, upload, download."""
+
+from fastapi import APIRouter, Depends, Request, Response
+from kiln_schemas.errors import InputError
+from kiln_schemas.job import MissingReply, MissingRequest
+
+from kiln_service.api.common import PartsHere, Sha256Path, any_caller, problems
+from kiln_service.api.files import serve_blob
+from kiln_service.config import Scope
+
+router = APIRouter(prefix="/v1/blobs", tags=["blobs"])
+
+Uploader = Depends(any_caller(Scope.SUBMIT, Scope.WORKER, Scope.ADMIN))
+Downloader = Depends(any_caller(Scope.READ, Scope.WORKER, Scope.ADMIN))
+
+
+@router.post("/missing", dependencies=[Uploader], responses=problems(422))
+async def missing(request: MissingRequest, parts: PartsHere) -> MissingReply:
+    """Which of these blobs have to be uploaded; the others are kept for an hour at least."""
+    return MissingReply(missing=tuple(await parts.blobs.missing(request.sha256)))
+
+
+@router.put(
+    "/{sha256}",
+    status_code=201,
+    response_class=Response,
+    dependencies=[Uploader],
+    responses=problems(400, 413, 422, 507) | {201: {"description": "Stored, or here already"}},
+    openapi_extra={"requestBody": {"required": True, "content": {"application/octet-stream": {}}}},
+)
+async def upload(sha256: Sha256Path, request: Request, parts: PartsHere) -> Response:
+    """Upload bytes; they are stored if, and only if, they are whole and have this hash."""
+    announced = request.headers.get("content-length")
+    if announced is not None and not announced.isdigit():
+        raise InputError(f"'{announced}' is not a length", where="Content-Length")
+    await parts.blobs.receive(sha256, request.stream(), int(announced) if announced else None)
+    return Response(status_code=201, headers={"ETag": f'"{sha256}"'})
+
+
+@router.api_route(
+    "/{sha256}",
+    methods=["GET", "HEAD"],
+    dependencies=[Downloader],
+    response_class=Response,
+    responses=problems(404, 416)
+    | {
+        200: {"description": "The bytes", "content": {"application/octet-stream": {}}},
+        206: {"description": "The range asked for"},
+        304: {"description": "The client has it"},
+    },
+)
+async def download(sha256: Sha256Path, request: Request, parts: PartsHere) -> Response:
+    """Download a blob, whole or a range of it."""
+    size = await parts.blobs.size(sha256)
+    return serve_blob(request, parts.blobs, sha256, size, "application/octet-stream")

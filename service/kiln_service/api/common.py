@@ -1,0 +1,91 @@
+"""What routes share: the parts of the running coordinator, the caller, the errors they document."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
+
+from fastapi import Depends, Path, Request, Security
+from fastapi.security import HTTPBearer
+from kiln_schemas.errors import Problem
+
+from kiln_service.auth import Principal
+from kiln_service.blobs import Blobs
+from kiln_service.config import Scope, ServiceConfig
+from kiln_service.db import Database
+from kiln_service.events import Signals
+from kiln_service.work import Work
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a coordinator consists of; `app.state.parts` while it runs."""
+
+    config: ServiceConfig
+    database: Database
+    blobs: Blobs
+    signals: Signals
+    work: Work
+
+
+_bearer = HTTPBearer(auto_error=False, description="An access token (the file `token` of the data folder).")
+
+
+def _parts(request: Request) -> Parts:
+    parts = request.app.state.parts
+    assert isinstance(parts, Parts)
+    return parts
+
+
+def caller(scope: Scope) -> Callable[..., Principal]:
+    """A dependency: the authenticated caller, who must have the scope."""
+
+    def check(request: Request, _: Annotated[object, Security(_bearer)]) -> Principal:
+        principal = request.scope["principal"]
+        assert isinstance(principal, Principal)
+        principal.require(scope)
+        return principal
+
+    return check
+
+
+def any_caller(*scopes: Scope) -> Callable[..., Principal]:
+    """A dependency: the authenticated caller, who must have one of the scopes."""
+
+    def check(request: Request, _: Annotated[object, Security(_bearer)]) -> Principal:
+        principal = request.scope["principal"]
+        assert isinstance(principal, Principal)
+        if not principal.scopes & set(scopes):
+            principal.require(scopes[0])
+        return principal
+
+    return check
+
+
+PartsHere = Annotated[Parts, Depends(_parts)]
+Sha256Path = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$", description="sha256 of the bytes, in lower-case hex")]
+
+_MEANINGS: Final = {
+    400: "The upload ended early",
+    401: "No token, or an unknown one",
+    403: "The token lacks the scope",
+    404: "Not there",
+    409: "The request contradicts the present state",
+    413: "Too large",
+    416: "The range is not in the file",
+    422: "The input is not usable",
+    507: "No space",
+}
+
+
+def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI responses: problem documents with these codes, and those that every route may give."""
+    return {
+        code: {
+            "description": _MEANINGS[code],
+            "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
+        }
+        for code in sorted({401, 403, *codes})
+    }
+
+
+PROBLEM_SCHEMA: Final = Problem.model_json_schema()

@@ -1,0 +1,137 @@
+"""Routes of jobs, their tasks, events and artifacts."""
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.responses import PlainTextResponse, StreamingResponse
+from kiln_schemas.errors import InputError
+from kiln_schemas.job import EventView, JobPage, JobRequest, JobView, TaskView
+from kiln_schemas.states import JobState, TaskState
+from kiln_schemas.tasks import Artifact, TaskKind
+
+from kiln_service import jobs, views
+from kiln_service.api.common import PartsHere, caller, problems
+from kiln_service.api.files import serve_blob
+from kiln_service.auth import Principal
+from kiln_service.config import Scope
+from kiln_service.events import BATCH, is_over, read_events, stream_events
+
+router = APIRouter(prefix="/v1", tags=["jobs"])
+
+Reader = Depends(caller(Scope.READ))
+Submitter = Annotated[Principal, Depends(caller(Scope.SUBMIT))]
+
+
+@router.post("/jobs", status_code=201, responses=problems(409, 413, 422))
+async def submit(request: JobRequest, parts: PartsHere, who: Submitter, response: Response) -> JobView:
+    """Submit a bake of files that were uploaded before."""
+    job = await jobs.submit(parts.database, parts.config, request, who.actor)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    return await views.job_view(parts.database, job.id)
+
+
+@router.get("/jobs", dependencies=[Reader], responses=problems(422))
+async def list_jobs(
+    parts: PartsHere,
+    state: Annotated[list[JobState] | None, Query(description="only jobs in one of these states")] = None,
+    cursor: Annotated[str | None, Query(description="`next` of the page before")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 50,
+) -> JobPage:
+    """Jobs, newest first."""
+    size = min(limit, parts.config.limits.page)
+    return await views.job_page(parts.database, state or (), views.parse_cursor(cursor), size)
+
+
+@router.get("/jobs/{job_id}", dependencies=[Reader], responses=problems(404))
+async def job(job_id: str, parts: PartsHere) -> JobView:
+    """One job with its stages, the time left and, if it failed, why."""
+    return await views.job_view(parts.database, job_id)
+
+
+@router.post("/jobs/{job_id}/cancel", responses=problems(404, 409))
+async def cancel(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
+    """Ask the job to stop; it is canceled once its running tasks have stopped."""
+    await jobs.cancel(parts.database, job_id, who.actor)
+    return await views.job_view(parts.database, job_id)
+
+
+@router.get("/jobs/{job_id}/tasks", dependencies=[Reader], responses=problems(404, 422))
+async def tasks(
+    job_id: str, parts: PartsHere, kind: TaskKind | None = None, state: TaskState | None = None
+) -> tuple[TaskView, ...]:
+    """The job's tasks in the order of planning."""
+    return await views.task_views(parts.database, job_id, kind, state)
+
+
+@router.get("/tasks/{task_id}/log", dependencies=[Reader], responses=problems(404), response_class=PlainTextResponse)
+async def log(task_id: str, parts: PartsHere) -> PlainTextResponse:
+    """What the task's attempts wrote."""
+    return PlainTextResponse(await views.task_log(parts.database, task_id))
+
+
+@router.get(
+    "/jobs/{job_id}/events",
+    dependencies=[Reader],
+    response_model=None,
+    responses=problems(404, 422)
+    | {
+        200: {
+            "description": "The history so far as a list (`format=json`), or past and coming events as a stream",
+            "content": {
+                "text/event-stream": {"schema": {"type": "string"}},
+                "application/json": {"schema": {"type": "array", "items": EventView.model_json_schema()}},
+            },
+        },
+        204: {"description": "The job is over and every event was read: do not reconnect"},
+    },
+)
+async def events(
+    job_id: str,
+    parts: PartsHere,
+    format: Literal["sse", "json"] = "sse",
+    after: Annotated[int | None, Query(ge=0, lt=2**63, description="only events with greater ids")] = None,
+    limit: Annotated[int, Query(ge=1, le=10_000, description="most events of a list")] = BATCH,
+    last_event_id: Annotated[str | None, Header(description="where a stream that broke goes on")] = None,
+) -> Response | list[EventView]:
+    """The job's history. A stream ends when the job is over and goes on after `Last-Event-ID`."""
+    start = after if after is not None else _event_id(last_event_id)
+    if format == "json":
+        return await read_events(parts.database, job_id, start, limit)
+    if await is_over(parts.database, job_id, start):
+        return Response(status_code=204)
+    stream = stream_events(parts.database, parts.signals, job_id, start, parts.config.timing.poll_s)
+    return StreamingResponse(
+        stream, media_type="text/event-stream", headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    )
+
+
+@router.get("/jobs/{job_id}/artifacts", dependencies=[Reader], responses=problems(404))
+async def artifacts(job_id: str, parts: PartsHere) -> tuple[Artifact, ...]:
+    """What the job published: empty until it has completed."""
+    return await views.artifacts(parts.database, job_id)
+
+
+@router.api_route(
+    "/jobs/{job_id}/artifacts/{name:path}",
+    methods=["GET", "HEAD"],
+    dependencies=[Reader],
+    response_class=Response,
+    responses=problems(404, 416)
+    | {
+        200: {"description": "The file; its ETag is the sha256", "content": {"application/octet-stream": {}}},
+        206: {"description": "The range asked for"},
+        304: {"description": "The client has it"},
+    },
+)
+async def artifact(job_id: str, name: str, request: Request, parts: PartsHere) -> Response:
+    """Download an artifact, whole or a range of it."""
+    found = await views.artifact(parts.database, job_id, name)
+    return serve_blob(request, parts.blobs, found.sha256, found.size, found.media_type)
+
+
+def _event_id(header: str | None) -> int:
+    if not header:
+        return 0
+    if not header.isascii() or not header.isdigit() or len(header) > 18:
+        raise InputError(f"'{header}' is not an event's id", where="Last-Event-ID")
+    return int(header)

@@ -1,0 +1,93 @@
+"""The coordinator as an ASGI application.
+
+It keeps nothing in memory that matters: all state is in the database and the blob storage, so any number of
+coordinators may serve the same ones, and one that is killed loses nothing that it had answered.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+
+from fastapi import Depends, FastAPI
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import JSONResponse
+from kiln_schemas import __version__
+from kiln_schemas.errors import InputError
+
+from kiln_service import problems
+from kiln_service.api import blobs as blob_routes
+from kiln_service.api import health as health_routes
+from kiln_service.api import jobs as job_routes
+from kiln_service.api import workers as worker_routes
+from kiln_service.api.common import PROBLEM_SCHEMA, Parts, caller
+from kiln_service.auth import TokenBook, own_token
+from kiln_service.blobs import Blobs
+from kiln_service.config import Scope, ServiceConfig
+from kiln_service.db import Database
+from kiln_service.db.migrate import migrate
+from kiln_service.events import Signals
+from kiln_service.maintenance import Maintenance
+from kiln_service.work import Work
+
+
+def create_app(config: ServiceConfig) -> FastAPI:
+    """The application for a configuration whose `database` is set (`serve.py` starts the embedded one)."""
+    config.data.mkdir(parents=True, exist_ok=True)
+    app = FastAPI(
+        title="lightkiln",
+        version=__version__,
+        summary="Distributed bakes of spherical Gaussian light-field textures",
+        lifespan=lambda app: _lifespan(app, config),
+        openapi_url=None,
+        docs_url=None,
+        redoc_url=None,
+    )
+    for module in (job_routes, blob_routes, worker_routes, health_routes):
+        app.include_router(module.router)
+
+    @app.get("/v1/openapi.json", tags=["health"], dependencies=[Depends(caller(Scope.READ))])
+    async def openapi() -> JSONResponse:
+        """This interface, as OpenAPI."""
+        return JSONResponse(openapi_document(app))
+
+    problems.install(app, TokenBook([own_token(config.data), *config.tokens]), config.limits)
+    return app
+
+
+def openapi_document(app: FastAPI) -> dict[str, object]:
+    """The OpenAPI document, with problem documents in place of FastAPI's own validation errors."""
+    document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+    schemas = document["components"]["schemas"]
+    for name in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(name, None)
+    schemas["Problem"] = PROBLEM_SCHEMA
+    problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    for path in document["paths"].values():
+        for operation in path.values():
+            if "422" in operation["responses"]:
+                operation["responses"]["422"] = {"description": "The input is not usable", "content": problem}
+    return document
+
+
+@contextlib.asynccontextmanager
+async def _lifespan(app: FastAPI, config: ServiceConfig) -> AsyncIterator[None]:
+    """Connect, migrate, run the background work; undo it all at the end."""
+    if config.database is None:
+        raise InputError("no database is configured", where="database", remedy="Start it with `lightkiln serve`.")
+    async with Database(config.database, config.pool_size) as database:
+        await migrate(database)
+        signals = Signals(database)
+        blobs = Blobs(database, config.blob_base, config.incoming, config.limits)
+        work = Work(database, config, signals)
+        app.state.parts = Parts(config, database, blobs, signals, work)
+        background = [
+            asyncio.create_task(signals.listen(), name="signals"),
+            asyncio.create_task(Maintenance(database, config, work, blobs).run(), name="maintenance"),
+        ]
+        try:
+            yield
+        finally:
+            signals.stop()
+            for task in background:
+                task.cancel()
+            await asyncio.gather(*background, return_exceptions=True)

@@ -1,0 +1,113 @@
+"""Everything that can be configured about a coordinator, as one frozen model.
+
+`python -m kiln_service --config FILE` reads it from JSON; flags override single fields. Secrets are
+not in it: access tokens appear as hashes only (`auth.py`).
+"""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from kiln_schemas.base import Contract
+from kiln_schemas.errors import InputError
+from kiln_schemas.tasks import Sha256
+from pydantic import Field, ValidationError
+
+
+class Scope(StrEnum):
+    """What a token allows; every route names the one it needs."""
+
+    READ = "read"
+    """Look at jobs, tasks, events; download artifacts and blobs."""
+    SUBMIT = "submit"
+    """Upload blobs, submit and cancel jobs."""
+    WORKER = "worker"
+    """Claim tasks, upload and download their blobs, commit them."""
+    ADMIN = "admin"
+    """All of the above."""
+
+
+class TokenEntry(Contract):
+    """An access token as the coordinator knows it: its hash, never itself."""
+
+    name: str = Field(min_length=1, max_length=64)
+    sha256: Sha256
+    scopes: tuple[Scope, ...] = Field(min_length=1)
+
+
+class Limits(Contract):
+    """Bounds that keep one client from exhausting the coordinator."""
+
+    blob_bytes: int = Field(default=8 * 2**30, gt=0)
+    """Largest blob."""
+    body_bytes: int = Field(default=16 * 2**20, gt=0)
+    """Largest body of any request but a blob upload."""
+    reserve_bytes: int = Field(default=256 * 2**20, ge=0)
+    """Uploads are refused when the disk would have less free space than this."""
+    page: int = Field(default=200, gt=0)
+    """Most jobs on a page."""
+    tiles: int = Field(default=65536, gt=0)
+    """Most render tiles of a job."""
+
+
+class Timing(Contract):
+    """Intervals in seconds."""
+
+    heartbeat_s: float = Field(default=5.0, gt=0)
+    """Told to workers: beat at least this often while a task runs."""
+    stale_s: float = Field(default=30.0, gt=0)
+    """A running task without a heartbeat for this long has lost its worker."""
+    poll_s: float = Field(default=1.0, gt=0)
+    """Longest sleep of a waiting claim or event stream (a retried job sends no NOTIFY)."""
+    maintenance_s: float = Field(default=5.0, gt=0)
+    """Between two passes of the reaper and the reconciler."""
+    blob_grace_s: float = Field(default=3600.0, gt=0)
+    """A blob that nothing uses is kept this long after it was last uploaded or asked for."""
+
+
+class ServiceConfig(Contract):
+    """A coordinator. Without `database` an embedded PostgreSQL is run in `<data>/postgres`."""
+
+    data: Path
+    """Folder for the token, temporary files and, by default, everything else."""
+    host: str = "127.0.0.1"
+    port: int = Field(default=8321, ge=0, le=65535)
+    database: str | None = None
+    """libpq connection string."""
+    store_url: str | None = None
+    """Where light-field stores go, `file://` or `s3://`, reachable from every worker; `<data>/store` by default."""
+    blob_url: str | None = None
+    """Where blobs go, `file://` or `s3://`; `<data>/blobs` by default."""
+    tokens: tuple[TokenEntry, ...] = ()
+    """Tokens besides the one in `<data>/token`."""
+    max_attempts: int = Field(default=4, ge=1)
+    """A task fails for good after this many attempts in a row that ended without a new checkpoint."""
+    pool_size: int = Field(default=10, ge=2)
+    """Database connections."""
+    limits: Limits = Limits()
+    timing: Timing = Timing()
+
+    @property
+    def store_base(self) -> str:
+        """The folder URL under which every job has its light-field store."""
+        return (self.store_url or (self.data.absolute() / "store").as_uri()).rstrip("/")
+
+    @property
+    def blob_base(self) -> str:
+        """The folder URL of the blobs."""
+        return (self.blob_url or (self.data.absolute() / "blobs").as_uri()).rstrip("/")
+
+    @property
+    def incoming(self) -> Path:
+        """Where uploads grow until their hash is known; on the blobs' file system when those are local."""
+        return self.data / "incoming"
+
+
+def make_config(tree: dict[str, Any]) -> ServiceConfig:
+    """Validate a configuration; InputError names the first field at fault."""
+    try:
+        return ServiceConfig.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "configuration"
+        raise InputError(f"{first.get('input')!r} is refused: {first['msg']}", where=where) from None

@@ -1,0 +1,61 @@
+"""Bring the database to the schema of this version, once, however many coordinators start together.
+
+The migrations are the files `migrations/NNNN_*.sql`, applied in order in one transaction under an advisory
+lock; procrastinate's schema is applied as it ships. A database that a newer version migrated is refused.
+"""
+
+import hashlib
+from importlib import resources
+from typing import Final
+
+from kiln_schemas.errors import Conflict
+from procrastinate.schema import SchemaManager
+
+from kiln_service.db.database import Database, Tx
+
+MIGRATION_LOCK: Final = 0x6B696C6E_0001
+"""Advisory lock number: "kiln", 1."""
+
+
+def migrations() -> list[tuple[int, str, str]]:
+    """Number, name and SQL of every migration, in order."""
+    folder = resources.files(__package__) / "migrations"
+    files = sorted((f for f in folder.iterdir() if f.name.endswith(".sql")), key=lambda f: f.name)
+    return [(int(f.name[:4]), f.name, f.read_text(encoding="utf-8")) for f in files]
+
+
+async def migrate(database: Database) -> list[str]:
+    """Apply what is missing; the names of the migrations applied."""
+    async with database.transaction() as tx:
+        await tx.run("lock_migrations", lock=MIGRATION_LOCK)
+        await tx.run("make_migrations_table")
+        done = {row["version"]: row for row in await tx.all("list_migrations")}
+        known = migrations()
+        if done and max(done) > known[-1][0]:
+            raise Conflict(
+                f"the database has schema {max(done)}, this lightkiln knows {known[-1][0]}",
+                where="database",
+                remedy="Run the newer lightkiln that migrated it.",
+            )
+        await _apply_queue_schema(tx)
+        applied = []
+        for version, name, text in known:
+            digest = hashlib.sha256(text.encode()).hexdigest()
+            if version not in done:
+                await tx.connection.execute(text.encode())
+                await tx.run("record_migration", version=version, name=name, sha256=digest)
+                applied.append(name)
+            elif done[version]["sha256"] != digest:
+                raise Conflict(
+                    f"{name} is not the migration that this database has under that number",
+                    where="database",
+                    remedy="Use the lightkiln version that made the database, or a new database.",
+                )
+        return applied
+
+
+async def _apply_queue_schema(tx: Tx) -> None:
+    """Make procrastinate's tables where they are missing."""
+    if (await tx.one("has_queue_schema"))["present"]:
+        return
+    await tx.connection.execute(SchemaManager.get_schema())

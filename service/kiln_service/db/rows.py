@@ -1,0 +1,103 @@
+"""Rows of the database as frozen dataclasses with the contracts' types."""
+
+from dataclasses import dataclass, fields
+from datetime import datetime
+from typing import Any, Self
+
+from kiln_schemas.errors import Problem
+from kiln_schemas.settings import BakeSettings
+from kiln_schemas.states import JobState, TaskState
+from kiln_schemas.tasks import Bundle, Progress, TaskKind
+from psycopg.rows import DictRow
+
+
+class _Row:
+    @classmethod
+    def _picked(cls, row: DictRow) -> dict[str, Any]:
+        return {field.name: row[field.name] for field in fields(cls)}  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class JobRow(_Row):
+    """A row of `jobs`."""
+
+    id: str
+    name: str
+    method: str
+    state: JobState
+    settings: BakeSettings
+    bundle: Bundle
+    store_url: str
+    notes: tuple[str, ...]
+    error: Problem | None
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+
+    @classmethod
+    def of(cls, row: DictRow) -> Self:
+        """Parse what psycopg returned."""
+        values = cls._picked(row)
+        return cls(
+            **values
+            | {
+                "state": JobState(values["state"]),
+                "settings": BakeSettings.model_validate(values["settings"]),
+                "bundle": Bundle.model_validate(values["bundle"]),
+                "notes": tuple(values["notes"]),
+                "error": values["error"] and Problem.model_validate(values["error"]),
+            }
+        )
+
+
+@dataclass(frozen=True)
+class TaskRow(_Row):
+    """A row of `tasks`."""
+
+    id: str
+    job_id: str
+    kind: TaskKind
+    label: str
+    state: TaskState
+    attempt: int
+    strikes: int
+    spec: dict[str, Any]
+    result: dict[str, Any] | None
+    progress: Progress | None
+    worker_id: str | None
+    checkpoint: str | None
+    error: Problem | None
+    queue_job: int | None
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+
+    @classmethod
+    def of(cls, row: DictRow) -> Self:
+        """Parse what psycopg returned."""
+        values = cls._picked(row)
+        return cls(
+            **values
+            | {
+                "kind": TaskKind(values["kind"]),
+                "state": TaskState(values["state"]),
+                "progress": values["progress"] and Progress.model_validate(values["progress"]),
+                "error": values["error"] and Problem.model_validate(values["error"]),
+            }
+        )
+
+
+@dataclass(frozen=True)
+class WorkerRow(_Row):
+    """A row of `workers`."""
+
+    id: str
+    name: str
+    kinds: tuple[str, ...]
+    queue_worker: int
+
+    @classmethod
+    def of(cls, row: DictRow) -> Self:
+        """Parse what psycopg returned."""
+        values = cls._picked(row)
+        return cls(**values | {"kinds": tuple(values["kinds"])})

@@ -1,0 +1,34 @@
+-- Queries of kiln_service.db.migrate.
+
+-- name: lock_migrations
+-- Let one coordinator migrate at a time; held until the transaction ends.
+SELECT pg_advisory_xact_lock(%(lock)s);
+
+-- name: make_migrations_table
+-- The record of applied migrations.
+CREATE TABLE IF NOT EXISTS kiln_migrations (
+    version integer PRIMARY KEY,
+    name text NOT NULL,
+    sha256 text NOT NULL,
+    applied timestamptz NOT NULL DEFAULT now()
+);
+
+-- name: list_migrations
+-- What was applied before.
+SELECT version, sha256 FROM kiln_migrations;
+
+-- name: record_migration
+-- Remember an applied migration.
+INSERT INTO kiln_migrations (version, name, sha256) VALUES (%(version)s, %(name)s, %(sha256)s);
+
+-- name: has_queue_schema
+-- Whether procrastinate's tables are there.
+SELECT to_regclass('procrastinate_jobs') IS NOT NULL AS present;
+
+-- name: ping
+-- Whether the database answers and is migrated.
+SELECT count(*) AS migrations FROM kiln_migrations;
+
+-- name: try_leadership
+-- Take a session lock that one coordinator can hold; released when its connection ends.
+SELECT pg_try_advisory_lock(%(lock)s) AS leader;

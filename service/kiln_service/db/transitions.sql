@@ -1,0 +1,62 @@
+-- The only statements that write states; used by kiln_service.transitions and nobody else.
+
+-- name: insert_job
+-- A new job.
+INSERT INTO jobs (id, name, method, state, settings, bundle, store_url)
+VALUES (%(id)s, %(name)s, %(method)s, 'queued', %(settings)s, %(bundle)s, %(store_url)s)
+RETURNING *;
+
+-- name: insert_tasks
+-- New tasks of a job, given as a JSON array; ordinals continue after those that are there.
+INSERT INTO tasks (id, job_id, ordinal, kind, label, state, spec)
+SELECT planned.id, %(job_id)s, planned.place + (SELECT count(*) FROM tasks WHERE job_id = %(job_id)s),
+       planned.kind, planned.label, planned.state, planned.spec
+FROM jsonb_to_recordset(%(tasks)s)
+    AS planned (id text, place integer, kind text, label text, state text, spec jsonb);
+
+-- name: move_job
+-- Move a job, with the times and the error that belong to the move.
+UPDATE jobs
+SET state = %(after)s,
+    error = COALESCE(%(error)s, error),
+    started = CASE WHEN %(after)s::text = 'active' THEN now() ELSE started END,
+    finished = CASE WHEN %(final)s THEN now() ELSE finished END
+WHERE id = %(id)s AND state = %(before)s;
+
+-- name: move_task_queued
+-- waiting > queued.
+UPDATE tasks SET state = 'queued' WHERE id = %(id)s AND state = %(before)s;
+
+-- name: move_task_active
+-- queued > active: a new attempt begins.
+UPDATE tasks
+SET state = 'active', attempt = attempt + 1, worker_id = %(worker_id)s, progress = NULL,
+    started = now(), heartbeat = now()
+WHERE id = %(id)s AND state = %(before)s
+RETURNING *;
+
+-- name: move_task_requeued
+-- active > queued: the attempt ended without a result.
+UPDATE tasks
+SET state = 'queued', worker_id = NULL, progress = NULL, started = NULL, heartbeat = NULL,
+    strikes = strikes + %(strikes)s
+WHERE id = %(id)s AND state = %(before)s;
+
+-- name: move_task_completed
+-- active > completed: the attempt's result is the task's.
+UPDATE tasks
+SET state = 'completed', result = %(result)s, finished = now(), heartbeat = NULL
+WHERE id = %(id)s AND state = %(before)s;
+
+-- name: move_task_ended
+-- > failed or canceled.
+UPDATE tasks
+SET state = %(after)s, error = %(error)s, finished = now(), heartbeat = NULL
+WHERE id = %(id)s AND state = %(before)s;
+
+-- name: cancel_idle_tasks
+-- waiting, queued > canceled: all tasks of a job that no worker has.
+UPDATE tasks
+SET state = 'canceled', finished = now()
+WHERE job_id = %(job_id)s AND state = ANY(%(before)s)
+RETURNING id, queue_job;

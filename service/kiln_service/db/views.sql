@@ -1,0 +1,59 @@
+-- Queries that show jobs to clients.
+
+-- name: find_job
+-- One job.
+SELECT * FROM jobs WHERE id = %(id)s;
+
+-- name: job_state
+-- A job's state.
+SELECT state FROM jobs WHERE id = %(id)s;
+
+-- name: page_of_jobs
+-- Jobs, newest first, before a cursor and in one of the states.
+SELECT * FROM jobs
+WHERE (%(before)s::text IS NULL OR id < %(before)s) AND (%(states)s::text[] IS NULL OR state = ANY(%(states)s))
+ORDER BY id DESC
+LIMIT %(limit)s;
+
+-- name: stages
+-- Tasks of jobs by kind: counts, busy seconds, and for the tasks that run their fractions and elapsed seconds.
+SELECT job_id, kind,
+       count(*) AS total,
+       count(*) FILTER (WHERE state = 'completed') AS completed,
+       count(*) FILTER (WHERE state = 'active') AS active,
+       count(*) FILTER (WHERE state = 'failed') AS failed,
+       COALESCE(sum(extract(epoch FROM finished - started)) FILTER (WHERE state = 'completed'), 0)::float8 AS seconds,
+       array_agg(LEAST(COALESCE((progress ->> 'done')::float8 / (progress ->> 'total')::float8, 0), 1)
+           ORDER BY ordinal) FILTER (WHERE state = 'active') AS fractions,
+       array_agg(extract(epoch FROM now() - started)::float8
+           ORDER BY ordinal) FILTER (WHERE state = 'active') AS elapsed
+FROM tasks
+WHERE job_id = ANY(%(job_ids)s)
+GROUP BY job_id, kind;
+
+-- name: list_tasks
+-- Tasks of a job in the order of planning, of a kind and in a state where given.
+SELECT tasks.*, workers.name AS worker
+FROM tasks LEFT JOIN workers ON workers.id = tasks.worker_id
+WHERE job_id = %(job_id)s
+  AND (%(kind)s::text IS NULL OR kind = %(kind)s) AND (%(state)s::text IS NULL OR state = %(state)s)
+ORDER BY ordinal;
+
+-- name: find_task
+-- Whether a task is there.
+SELECT id FROM tasks WHERE id = %(id)s;
+
+-- name: read_events
+-- A job's history after an event.
+SELECT id, at, job_id, task_id, kind, actor, detail FROM events
+WHERE job_id = %(job_id)s AND id > %(after)s
+ORDER BY id
+LIMIT %(limit)s;
+
+-- name: list_artifacts
+-- What a job published.
+SELECT name, sha256, size, media_type FROM artifacts WHERE job_id = %(job_id)s ORDER BY name;
+
+-- name: find_artifact
+-- One artifact of a job.
+SELECT name, sha256, size, media_type FROM artifacts WHERE job_id = %(job_id)s AND name = %(name)s;

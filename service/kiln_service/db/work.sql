@@ -1,0 +1,121 @@
+-- Queries around claiming, running and finishing tasks.
+
+-- name: lock_job
+-- A job, locked; every transaction that changes a job or its tasks begins here.
+SELECT * FROM jobs WHERE id = %(id)s FOR UPDATE;
+
+-- name: lock_task
+-- A task, locked after its job.
+SELECT * FROM tasks WHERE id = %(id)s FOR UPDATE;
+
+-- name: job_of_task
+-- Which job to lock before a task.
+SELECT job_id FROM tasks WHERE id = %(id)s;
+
+-- name: tasks_in_state
+-- Tasks of a kind in a state, in the order of planning.
+SELECT * FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state = %(state)s ORDER BY ordinal FOR UPDATE;
+
+-- name: count_unfinished
+-- Tasks of a kind that have not completed.
+SELECT count(*) AS tasks FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state <> 'completed';
+
+-- name: count_active
+-- Tasks of a job that workers have.
+SELECT count(*) AS tasks FROM tasks WHERE job_id = %(job_id)s AND state = 'active';
+
+-- name: results_of_kind
+-- Results of a job's tasks of a kind, in the order of planning.
+SELECT result FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state = 'completed' ORDER BY ordinal;
+
+-- name: task_deferred
+-- Remember the queue jobs that carry tasks.
+UPDATE tasks
+SET queue_job = queue.id
+FROM procrastinate_jobs AS queue
+WHERE queue.id = ANY(%(queue_jobs)s) AND tasks.id = queue.args ->> 'task_id';
+
+-- name: notify_queued
+-- Wake the claims that wait.
+SELECT pg_notify('kiln_queued', %(kinds)s);
+
+-- name: add_event
+-- Append to a job's history and wake who watches it; the job is locked.
+WITH added AS (
+    INSERT INTO events (job_id, task_id, kind, actor, detail)
+    VALUES (%(job_id)s, %(task_id)s, %(kind)s, %(actor)s, %(detail)s)
+    RETURNING job_id
+)
+SELECT pg_notify('kiln_event', job_id) FROM added;
+
+-- name: insert_worker
+-- A worker that registered.
+INSERT INTO workers (id, name, kinds, memory_bytes, threads, device, version, queue_worker)
+VALUES (%(id)s, %(name)s, %(kinds)s, %(memory_bytes)s, %(threads)s, %(device)s, %(version)s, %(queue_worker)s);
+
+-- name: see_worker
+-- A registered worker, seen now.
+UPDATE workers SET seen = now() WHERE id = %(id)s RETURNING *;
+
+-- name: beat_task
+-- Keep an attempt alive; no row where the attempt is not the task's current one.
+UPDATE tasks
+SET heartbeat = now(), progress = COALESCE(%(progress)s, progress)
+FROM jobs
+WHERE tasks.id = %(id)s AND tasks.attempt = %(attempt)s AND tasks.state = 'active' AND jobs.id = tasks.job_id
+RETURNING jobs.state AS job_state;
+
+-- name: add_log
+-- Lines that an attempt wrote; nothing where the task is unknown.
+INSERT INTO task_logs (task_id, attempt, lines)
+SELECT id, %(attempt)s, %(lines)s FROM tasks WHERE id = %(task_id)s;
+
+-- name: task_log
+-- All lines of a task, oldest first.
+SELECT attempt, lines FROM task_logs WHERE task_id = %(task_id)s ORDER BY id;
+
+-- name: last_log
+-- The last pieces of a task's log, newest first.
+SELECT lines FROM task_logs WHERE task_id = %(task_id)s ORDER BY id DESC LIMIT 20;
+
+-- name: set_checkpoint
+-- Publish an attempt's checkpoint: progress was made, so earlier failures count no more.
+UPDATE tasks SET checkpoint = %(sha256)s, strikes = 0, heartbeat = now() WHERE id = %(id)s;
+
+-- name: add_notes
+-- Append to what a job tells its user.
+UPDATE jobs SET notes = notes || %(notes)s WHERE id = %(id)s;
+
+-- name: add_artifact
+-- Publish an artifact.
+INSERT INTO artifacts (job_id, name, sha256, size, media_type)
+VALUES (%(job_id)s, %(name)s, %(sha256)s, %(size)s, %(media_type)s);
+
+-- name: stale_tasks
+-- Running tasks whose worker was not heard of for a while, and those that run although their job is over.
+SELECT id, job_id FROM tasks
+WHERE state = 'active' AND heartbeat < now() - make_interval(secs => %(seconds)s)
+ORDER BY heartbeat;
+
+-- name: task_is_stale
+-- Whether that is still so, now that the task is locked.
+SELECT heartbeat < now() - make_interval(secs => %(seconds)s) AS stale FROM tasks WHERE id = %(id)s;
+
+-- name: queued_without_queue_job
+-- Queued tasks that nothing in the queue will bring to a worker.
+SELECT tasks.id, tasks.job_id FROM tasks
+LEFT JOIN procrastinate_jobs AS queue ON queue.id = tasks.queue_job AND queue.status = 'todo'
+WHERE tasks.state = 'queued' AND queue.id IS NULL;
+
+-- name: has_queue_job
+-- Whether a queue job waits for this task, now that the task is locked.
+SELECT EXISTS (
+    SELECT FROM procrastinate_jobs AS queue
+    WHERE queue.id = %(queue_job)s AND queue.status = 'todo'
+) AS present;
+
+-- name: queue_jobs_without_task
+-- Queue jobs that wait for a task which is not queued.
+SELECT queue.id FROM procrastinate_jobs AS queue
+LEFT JOIN tasks ON tasks.queue_job = queue.id AND tasks.state = 'queued'
+WHERE queue.status = 'todo' AND queue.task_name = %(task_name)s AND tasks.id IS NULL;

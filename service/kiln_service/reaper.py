@@ -1,0 +1,62 @@
+"""Take tasks away from workers that are no longer heard of.
+
+procrastinate's retry strategy never sees a crash, so attempts are capped here: a task that was lost too often fails
+with a sentence and the last lines it wrote. The heartbeat watched is the task's own, not its worker's: a worker
+whose claim's answer was lost on the way lives on without knowing of the task.
+"""
+
+import logging
+from typing import Final
+
+from kiln_schemas.errors import BakeFailed, Problem
+from kiln_schemas.states import TaskState
+
+from kiln_service import transitions
+from kiln_service.db import Database, TaskRow, Tx
+from kiln_service.jobs import withdraw
+from kiln_service.work import Work, lock_task
+
+log = logging.getLogger(__name__)
+
+LOG_LINES: Final = 8
+"""Lines of a lost task's log that its error quotes."""
+
+
+async def reap(database: Database, work: Work, stale_s: float) -> int:
+    """End every attempt without a heartbeat for `stale_s`; how many."""
+    async with database.transaction() as tx:
+        rows = await tx.all("stale_tasks", seconds=stale_s)
+    return sum([await _reap_one(database, work, row["id"], stale_s) for row in rows])
+
+
+async def _reap_one(database: Database, work: Work, task_id: str, stale_s: float) -> int:
+    async with database.transaction() as tx:
+        job, task = await lock_task(tx, task_id)
+        still = await tx.one("task_is_stale", id=task_id, seconds=stale_s)
+        if task.state is not TaskState.ACTIVE or not still["stale"]:
+            return 0
+        log.warning("%s %s of job %s: no heartbeat for %.0f s", task.kind, task.label, job.id, stale_s)
+        idle = await work.end_attempt(
+            tx,
+            job,
+            task,
+            await _lost(tx, task, stale_s),
+            kind="task.lost",
+            actor=transitions.COORDINATOR,
+            retryable=True,
+        )
+    await withdraw(database, idle)
+    return 1
+
+
+async def _lost(tx: Tx, task: TaskRow, stale_s: float) -> Problem:
+    """What the task's error says if this was its last attempt."""
+    pieces = await tx.all("last_log", task_id=task.id)
+    lines = "".join(reversed([row["lines"] for row in pieces])).strip().splitlines()[-LOG_LINES:]
+    quoted = f" Its last lines: {' | '.join(lines)}" if lines else " It wrote no log."
+    return BakeFailed(
+        f"the worker of attempt {task.attempt} was not heard of for {stale_s:g} s, "
+        f"the {task.strikes + 1}. attempt in a row to end without progress.{quoted}",
+        where=f"{task.kind} {task.label}",
+        remedy="Look for workers that crash or run out of memory (`lightkiln worker --memory`), then submit again.",
+    ).problem()

@@ -1,0 +1,209 @@
+"""`python -m kiln_service`: run one coordinator until it is told to stop.
+
+Locks the data folder, starts the embedded PostgreSQL where no --database is given, serves, and stops everything in
+the reverse order. With --json one line on standard output says when it is ready and how to reach it.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import shutil
+import signal
+import socket
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+import uvicorn
+from fastapi import FastAPI
+from kiln_schemas.errors import Conflict, InputError, KilnError, MachineLacks
+
+from kiln_service.app import create_app
+from kiln_service.auth import TOKEN_FILE
+from kiln_service.config import ServiceConfig, make_config
+from kiln_service.embedded import EmbeddedPostgres
+
+log = logging.getLogger("kiln_service")
+
+GRACE_S: Final = 5
+"""Open connections get this long to end when the coordinator stops."""
+WATCH_S: Final = 1.0
+"""Between two looks at whether the embedded database still runs."""
+
+
+class Server(uvicorn.Server):
+    """uvicorn's server, which says when it is ready, ends long polls when it stops, and stops with its database."""
+
+    def __init__(self, app: FastAPI, config: uvicorn.Config, announce: str, database: EmbeddedPostgres | None) -> None:
+        super().__init__(config)
+        self._app, self._announce, self._database = app, announce, database
+        self.lost_database = False
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets=sockets)
+        if not self.should_exit:
+            print(self._announce, flush=True)
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        super().handle_exit(sig, frame)
+        self._end_waiting()
+
+    async def watch_database(self) -> None:
+        """Stop when the embedded database is gone: a supervisor restarts both together."""
+        while self._database is None or self._database.alive():
+            await asyncio.sleep(WATCH_S)
+        self.lost_database = True
+        self.should_exit = True
+        self._end_waiting()
+
+    async def serve_all(self, sockets: list[socket.socket]) -> None:
+        """Serve, watching the database on the side."""
+        watch = asyncio.create_task(self.watch_database())
+        try:
+            await self.serve(sockets=sockets)
+        finally:
+            watch.cancel()
+
+    def _end_waiting(self) -> None:
+        parts = getattr(self._app.state, "parts", None)
+        if parts is not None:
+            parts.signals.stop()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run; the exit code (errors as in kiln_schemas.errors)."""
+    arguments = _parser().parse_args(argv)
+    logging.basicConfig(
+        level=arguments.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr
+    )
+    try:
+        config = _config(arguments)
+        _prepare_folder(config.data)
+        with _locked(config.data), contextlib.ExitStack() as stack:
+            shutil.rmtree(config.incoming, ignore_errors=True)
+            database = None
+            if config.database is None:
+                database = stack.enter_context(EmbeddedPostgres(config.data / "postgres"))
+                config = config.model_copy(update={"database": database.dsn})
+            return _serve(config, database, as_json=arguments.json)
+    except KilnError as error:
+        if arguments.json:
+            print(json.dumps({"error": error.problem().model_dump(mode="json")}), flush=True)
+        print(f"lightkiln: {error}", file=sys.stderr)
+        return error.exit_code
+
+
+def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json: bool) -> int:
+    with _bound(config.host, config.port) as listening:
+        host, port = listening.getsockname()[:2]
+        url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        token_file = str((config.data / TOKEN_FILE).absolute())
+        ready = {"url": url, "token_file": token_file, "data": str(config.data.absolute()), "pid": os.getpid()}
+        announce = json.dumps(ready) if as_json else f"lightkiln serves {url} (token in {token_file})"
+        app = create_app(config)
+        server = Server(
+            app,
+            uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_S, lifespan="on"),
+            announce,
+            database,
+        )
+        with _quiet_signals():
+            asyncio.run(server.serve_all([listening]))
+    if server.lost_database:
+        raise MachineLacks("the embedded database stopped", where=str(config.data), remedy="See postgres.log there.")
+    if not server.started:
+        raise MachineLacks("the coordinator could not start", remedy="Its log on standard error says why.")
+    return 0
+
+
+@contextlib.contextmanager
+def _quiet_signals() -> Iterator[None]:
+    """uvicorn raises the signals that stopped it once more after its shutdown; we have an orderly end to reach."""
+    kept = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    """A listening socket; Conflict where the port is taken."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listening = socket.socket(family, socket.SOCK_STREAM)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((host, port))
+    except OSError as error:
+        listening.close()
+        raise Conflict(
+            f"cannot listen there: {error.strerror or error}",
+            where=f"{host}:{port}",
+            remedy="Choose another --port (0 takes a free one) or --host.",
+        ) from None
+    listening.listen(128)
+    return listening
+
+
+def _prepare_folder(data: Path) -> None:
+    try:
+        data.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MachineLacks(
+            f"cannot make the data folder: {error.strerror}", where=str(data), remedy="Choose another --data."
+        ) from None
+
+
+@contextlib.contextmanager
+def _locked(data: Path) -> Iterator[None]:
+    """Hold the data folder; the kernel lets go of it when the process ends, however it ends."""
+    with (data / "lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise Conflict(
+                "another coordinator uses this data folder", where=str(data), remedy="Stop it or choose another --data."
+            ) from None
+        yield
+
+
+def _config(arguments: argparse.Namespace) -> ServiceConfig:
+    """The file given with --config, with the flags given on top."""
+    tree: dict[str, Any] = {}
+    if arguments.config is not None:
+        try:
+            tree = json.loads(arguments.config.read_text())
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot be read: {error}", where=str(arguments.config)) from None
+        if not isinstance(tree, dict):
+            raise InputError("is not a JSON object", where=str(arguments.config))
+    flags = {
+        "data": arguments.data,
+        "host": arguments.host,
+        "port": arguments.port,
+        "database": arguments.database,
+        "store_url": arguments.store,
+    }
+    tree |= {key: value for key, value in flags.items() if value is not None}
+    if "data" not in tree:
+        raise InputError("no data folder was given", where="--data", remedy="Pass --data DIR.")
+    return make_config(tree)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m kiln_service", description="Run a lightkiln coordinator.")
+    parser.add_argument("--data", type=Path, help="folder for the database, the token, blobs and stores")
+    parser.add_argument("--host", help="address to listen on (127.0.0.1)")
+    parser.add_argument("--port", type=int, help="port to listen on (8321; 0 takes a free one)")
+    parser.add_argument("--database", help="connection string of a PostgreSQL server (default: an embedded one)")
+    parser.add_argument("--store", help="URL of the folder for light-field stores, file:// or s3://")
+    parser.add_argument("--config", type=Path, help="JSON file with everything else (kiln_service.config)")
+    parser.add_argument("--json", action="store_true", help="announce readiness as one JSON line")
+    parser.add_argument("--log-level", default="info", choices=["debug", "info", "warning", "error"])
+    return parser

@@ -1,0 +1,180 @@
+"""The only writer of states: every move of a job or a task, its queue job and its event, in one transaction.
+
+Each function is one move of the tables in `kiln_schemas.states`; an illegal one raises IllegalTransition. The
+caller has locked the job and, for a move of a task, the task (`Tx`'s order of locks).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+from kiln_schemas.errors import IllegalTransition, Problem
+from kiln_schemas.settings import BakeSettings
+from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState, check_job_move, check_task_move
+from kiln_schemas.tasks import Bundle, Result
+from psycopg.types.json import Jsonb
+
+from kiln_service import queue
+from kiln_service.db import JobRow, TaskRow, Tx, WorkerRow
+from kiln_service.events import add_event
+from kiln_service.ids import new_id
+from kiln_service.planner import Planned
+
+COORDINATOR: Final = "coordinator"
+"""The actor of what nobody asked for."""
+
+
+async def create_job(
+    tx: Tx,
+    *,
+    name: str,
+    method: str,
+    settings: BakeSettings,
+    bundle: Bundle,
+    store_base: str,
+    planned: Sequence[Planned],
+    actor: str,
+) -> JobRow:
+    """A new job, queued, with its first tasks."""
+    job_id = new_id()
+    row = await tx.one(
+        "insert_job",
+        id=job_id,
+        name=name,
+        method=method,
+        settings=Jsonb(settings.model_dump(mode="json")),
+        bundle=Jsonb(bundle.model_dump(mode="json")),
+        store_url=f"{store_base}/{job_id}.zarr",
+    )
+    job = JobRow.of(row)
+    await add_event(tx, job.id, "job.created", actor, detail={"name": name})
+    await add_tasks(tx, job, planned)
+    return job
+
+
+async def add_tasks(tx: Tx, job: JobRow, planned: Sequence[Planned]) -> None:
+    """New tasks of a job: queued where ready, waiting otherwise."""
+    rows = [
+        {
+            "id": new_id(),
+            "place": place,
+            "kind": task.kind.value,
+            "label": task.label,
+            "state": (TaskState.QUEUED if task.ready else TaskState.WAITING).value,
+            "spec": task.spec,
+        }
+        for place, task in enumerate(planned)
+    ]
+    await tx.run("insert_tasks", job_id=job.id, tasks=Jsonb(rows))
+    await queue.defer(tx, [(str(row["id"]), task.kind) for row, task in zip(rows, planned, strict=True) if task.ready])
+    counts: dict[str, int] = {}
+    for task in planned:
+        counts[task.kind.value] = counts.get(task.kind.value, 0) + 1
+    await add_event(tx, job.id, "tasks.planned", COORDINATOR, detail=counts)
+
+
+async def release_task(tx: Tx, task: TaskRow) -> None:
+    """waiting > queued."""
+    check_task_move(task.state, TaskState.QUEUED)
+    await _move(tx, "move_task_queued", task)
+    await queue.defer(tx, [(task.id, task.kind)])
+    await _task_event(tx, task, "task.queued", COORDINATOR)
+
+
+async def claim_task(tx: Tx, job: JobRow, task: TaskRow, worker: WorkerRow) -> TaskRow:
+    """queued > active under a new attempt; the job's first claim moves it to active too."""
+    check_task_move(task.state, TaskState.ACTIVE)
+    claimed = TaskRow.of(await tx.one("move_task_active", id=task.id, before=task.state, worker_id=worker.id))
+    if job.state is JobState.QUEUED:
+        await move_job(tx, job, JobState.ACTIVE, COORDINATOR)
+    await _task_event(tx, claimed, "task.claimed", f"worker:{worker.id}", {"worker": worker.name})
+    return claimed
+
+
+async def requeue_task(tx: Tx, task: TaskRow, kind: str, actor: str, *, strike: bool, reason: str) -> None:
+    """active > queued: another attempt may try; `kind` is the event (`task.retried`, `task.lost`)."""
+    if task.state is not TaskState.ACTIVE:
+        raise IllegalTransition(f"a task that is {task.state} cannot be retried")
+    check_task_move(task.state, TaskState.QUEUED)
+    await _move(tx, "move_task_requeued", task, strikes=int(strike))
+    await queue.retry(tx, task.queue_job, (task.id, task.kind))
+    await _task_event(tx, task, kind, actor, {"reason": reason, "strikes": task.strikes + int(strike)})
+
+
+async def complete_task(tx: Tx, task: TaskRow, result: Result) -> None:
+    """active > completed."""
+    check_task_move(task.state, TaskState.COMPLETED)
+    await _move(tx, "move_task_completed", task, result=Jsonb(result.model_dump(mode="json")))
+    await queue.finish(tx, task.queue_job)
+    await _task_event(tx, task, "task.completed", f"worker:{task.worker_id}", {"seconds": result.seconds})
+
+
+async def fail_task(tx: Tx, job: JobRow, task: TaskRow, problem: Problem, actor: str) -> list[int]:
+    """active > failed, and the job with it; returns the queue jobs to withdraw afterwards."""
+    check_task_move(task.state, TaskState.FAILED)
+    await _move(tx, "move_task_ended", task, after=TaskState.FAILED, error=Jsonb(problem.model_dump(mode="json")))
+    await queue.finish(tx, task.queue_job)
+    await _task_event(tx, task, "task.failed", actor, {"problem": problem.model_dump(mode="json")})
+    return await fail_job(tx, job, problem, actor)
+
+
+async def cancel_task(tx: Tx, task: TaskRow, actor: str, reason: str) -> None:
+    """active > canceled: its worker was told to stop, or is lost."""
+    check_task_move(task.state, TaskState.CANCELED)
+    await _move(tx, "move_task_ended", task, after=TaskState.CANCELED, error=None)
+    await queue.finish(tx, task.queue_job)
+    await _task_event(tx, task, "task.canceled", actor, {"reason": reason})
+
+
+async def cancel_idle_tasks(tx: Tx, job: JobRow, actor: str) -> list[int]:
+    """waiting, queued > canceled, all of a job; returns the queue jobs to withdraw in a later transaction."""
+    before = [TaskState.WAITING, TaskState.QUEUED]
+    for state in before:
+        check_task_move(state, TaskState.CANCELED)
+    rows = await tx.all("cancel_idle_tasks", job_id=job.id, before=[state.value for state in before])
+    if rows:
+        await add_event(tx, job.id, "tasks.canceled", actor, detail={"count": len(rows)})
+    return [row["queue_job"] for row in rows if row["queue_job"] is not None]
+
+
+async def move_job(
+    tx: Tx,
+    job: JobRow,
+    after: JobState,
+    actor: str,
+    *,
+    error: Problem | None = None,
+    detail: dict[str, Any] | None = None,
+) -> JobRow:
+    """Move a job and tell it."""
+    check_job_move(job.state, after)
+    moved = await tx.run(
+        "move_job",
+        id=job.id,
+        before=job.state,
+        after=after.value,
+        final=after in FINAL_JOB_STATES,
+        error=Jsonb(error.model_dump(mode="json")) if error else None,
+    )
+    if moved != 1:
+        raise IllegalTransition(f"job {job.id} is no longer {job.state}")
+    told = (detail or {}) | ({"problem": error.model_dump(mode="json")} if error else {})
+    await add_event(tx, job.id, f"job.{after.value}", actor, detail=told)
+    return replace(job, state=after, error=error or job.error)
+
+
+async def fail_job(tx: Tx, job: JobRow, problem: Problem, actor: str) -> list[int]:
+    """The job fails with this error and its idle tasks are canceled; returns the queue jobs to withdraw."""
+    idle = await cancel_idle_tasks(tx, job, actor)
+    await move_job(tx, job, JobState.FAILED, actor, error=problem)
+    return idle
+
+
+async def _move(tx: Tx, query: str, task: TaskRow, **parameters: Any) -> None:
+    if await tx.run(query, id=task.id, before=task.state, **parameters) != 1:
+        raise IllegalTransition(f"task {task.id} is no longer {task.state}")
+
+
+async def _task_event(tx: Tx, task: TaskRow, kind: str, actor: str, detail: dict[str, Any] | None = None) -> None:
+    about = {"kind": task.kind.value, "label": task.label, "attempt": task.attempt}
+    await add_event(tx, task.job_id, kind, actor, task_id=task.id, detail=about | (detail or {}))
