@@ -279,5 +279,6 @@ def _lightmap(texel_map: TexelMapLike) -> dict[str, Any]:
         "valid": int(valid.sum()),
         "invalid": int((covered & ~valid).sum()),
         "charts": int(np.unique(chart[chart >= 0]).size),
+        "invalid_texels": np.flatnonzero(covered & ~valid).tolist(),  # row * width + column
         "worst_texel_size_m": float(texel_map.texel_size[covered].max()),
     }
