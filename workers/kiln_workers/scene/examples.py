@@ -2,7 +2,7 @@
 
 After Currius et al. 2020, Table 2 (objects and planes of GGX alpha 0.2 ... 0.5 from left to right, lit by emitting arcs
 that reflect in them) and Table 3 (the same materials under a sky with a small bright sun, occluded by walls and
-columns). Every surface is a `shapes.patch`, with light-map charts laid out by hand for 64 x 64 texels; a chart's cell is
+columns). Every surface is a `shapes.patch`, with light-map charts laid out by hand for 64 x 64 texels; a cell is
 given in units of two texels, its gutter included.
 """
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-
 from kiln_schemas.errors import InputError, TooLarge
+
 from kiln_workers.scene.model import Mesh
 
 Floats = npt.NDArray[np.float64]

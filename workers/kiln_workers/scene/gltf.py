@@ -2,8 +2,8 @@
 
 Khronos glTF 2.0 with KHR_materials_emissive_strength, KHR_lights_punctual, KHR_texture_transform,
 KHR_mesh_quantization, KHR_materials_unlit and EXT_mesh_gpu_instancing. Read by an own reader over pydantic models
-(`gltf_document`), as general loaders drop TEXCOORD_1 or believe a stranger's offsets. What the light-field method has no
-use for is ignored with a note; a *required* extension that is not in the list is refused by name. Photometric and
+(`gltf_document`), as general loaders drop TEXCOORD_1 or believe a stranger's offsets. What the method has no use for
+is ignored with a note; a *required* extension that is not in the list is refused by name. Photometric and
 radiometric units of lights are taken one to one, as renderers of glTF do (candela as W/sr, lux as W/m^2).
 """
 
@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-
 from kiln_schemas.errors import InputError
+
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.geometry import Floats, Ints, RawMesh, check_triangle_count, place, unique_names
 from kiln_workers.scene.gltf_buffers import GltfBuffers, split_glb

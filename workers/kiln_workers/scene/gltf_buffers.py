@@ -13,8 +13,8 @@ from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
-
 from kiln_schemas.errors import InputError
+
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.gltf_document import Accessor, Document, pick
 

@@ -1,7 +1,7 @@
 """A clear sky with a small bright sun as an equirectangular image, for the courtyard example.
 
 Preetham, Shirley and Smits 1999, "A Practical Analytic Model for Daylight": the Perez distribution
-F(theta, gamma) = (1 + A exp(B / cos theta)) (1 + C exp(D gamma) + E cos^2 gamma), luminance and chromaticity by turbidity
+F(theta, gamma) = (1 + A exp(B / cos theta)) (1 + C exp(D gamma) + E cos^2 gamma), for luminance and chromaticity
 (their appendix A.2). The sun's disk is wider than the real one (so that it spans several pixels) and carries a chosen
 multiple of the sky's irradiance. Below the horizon lies even ground lit by both.
 """

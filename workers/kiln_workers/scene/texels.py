@@ -1,0 +1,180 @@
+"""From the light-map UVs to the texel map: conservative rasterisation of all charts (light-field paper, section 4).
+
+A texel that a chart's triangle touches gets the point of that chart closest to the texel's centre, so bilinear
+interpolation on the surface never needs a texel without a point. Where several triangles touch one texel, one
+that contains the centre wins, else the nearest. `alpha` is the material's roughness at that point, squared, at least
+0.002 (Filament's bound for perceptual roughness, 0.045, squared): narrower lobes are mirrors to every later stage.
+
+Terminator of smooth normals: paths start from the point that Hanika 2021 ("Hacking the Shadow Terminator", Ray Tracing
+Gems II, chapter 4) gives: the flat triangle's point is lifted to the interpolation of its projections on the vertices' tangent
+planes, where those lie above it. It follows the surface that the normals pretend, so facets do not shadow each other.
+Limited to half a texel; flat-shaded and concave faces are not moved.
+"""
+
+from typing import Final
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from kiln_schemas.errors import InputError
+from kiln_workers.scene.geometry import Floats, Ints, face_areas, face_normals
+from kiln_workers.scene.model import Image, Mesh, Scene, TextureRef
+from kiln_workers.scene.push_out import push_out
+from kiln_workers.scene.raster import touched_squares
+from kiln_workers.scene.texel_map import TexelMap, TexelState
+
+MIN_ALPHA: Final = 0.002
+MIN_COSINE: Final = 0.05
+"""A shading normal is bent towards the geometric one until their cosine is at least this."""
+
+
+def build_texel_map(scene: Scene, resolution: int, device: str = "auto") -> TexelMap:
+    """The texel map of a scene whose meshes have light-map UVs, points pushed out of other geometry."""
+    return push_out(scene, rasterise_texels(scene, resolution), device)
+
+
+def rasterise_texels(scene: Scene, resolution: int) -> TexelMap:
+    """The texel map before points are pushed out of other geometry."""
+    faces = _AllFaces(scene)
+    touched = touched_squares(faces.lightmap_uv * resolution, resolution, resolution)
+    corner = faces.corners[touched.face]  # [S, 3] rows of the vertex arrays
+    weight = touched.barycentric
+
+    normal = faces.normal[touched.face]
+    position = np.einsum("sc,scd->sd", weight, faces.positions[corner])
+    shading = np.einsum("sc,scd->sd", weight, faces.normals[corner])
+    size = faces.texel_size(resolution)[touched.face]
+    lift = terminator_offset(position, weight, faces.positions[corner], faces.normals[corner])
+    length = np.linalg.norm(lift, axis=1)
+    lift *= np.minimum(1.0, 0.5 * size / np.maximum(length, 1e-30))[:, None]
+
+    grid = (resolution, resolution)
+    mesh = faces.mesh[touched.face]
+
+    def spread(values: Floats | Ints, dtype: type, empty: float = 0) -> np.ndarray[tuple[int, ...], np.dtype[np.generic]]:
+        out = np.full((resolution * resolution, *values.shape[1:]), empty, dtype=dtype)
+        out[touched.square] = values
+        return out.reshape(*grid, *values.shape[1:])
+
+    return TexelMap(
+        state=spread(np.full(len(mesh), TexelState.VALID), np.uint8),
+        position=spread(position + lift, np.float32),
+        normal=spread(normal, np.float32),
+        shading_normal=spread(bent_normals(shading, normal), np.float32),
+        alpha=spread(_alpha(scene, mesh, np.einsum("sc,scd->sd", weight, faces.uv[corner])), np.float32),
+        texel_size=spread(size, np.float32),
+        mesh=spread(mesh, np.int32, -1),
+        chart=spread(faces.charts()[touched.face], np.int32, -1),
+    )
+
+
+def terminator_offset(position: Floats, weight: Floats, corners: Floats, normals: Floats) -> Floats:
+    """Hanika's offset [S, 3] of points with barycentrics `weight` [S, 3] in triangles [S, 3, 3] of unit normals [S, 3, 3].
+
+    Hanika moves the point by sum_i w_i (t_i - min(0, t_i . n_i) n_i) with t_i = P - v_i; as sum_i w_i t_i = 0, that is
+    - sum_i w_i min(0, t_i . n_i) n_i.
+    """
+    below = np.minimum(0.0, np.einsum("scd,scd->sc", position[:, None] - corners, normals))
+    return np.asarray(-np.einsum("sc,scd->sd", weight * below, normals))
+
+
+def bent_normals(shading: Floats, geometric: Floats) -> Floats:
+    """Unit shading normals [S, 3] kept in the hemisphere of unit `geometric`; those that oppose it are replaced."""
+    length = np.linalg.norm(shading, axis=1, keepdims=True)
+    unit = np.divide(shading, length, out=geometric.copy(), where=length > 1e-12)
+    cosine = np.einsum("sd,sd->s", unit, geometric)[:, None]
+    lifted = unit + np.maximum(MIN_COSINE - cosine, 0.0) * geometric
+    lifted = np.where(cosine < -0.5, geometric, lifted)
+    return np.asarray(lifted / np.linalg.norm(lifted, axis=1, keepdims=True))
+
+
+def sample_bilinear(image: Image, texture: TextureRef, uv: Floats, channel: int) -> Floats:
+    """One channel [S] of a texture at uv [S, 2], 8-bit values as 0 ... 1, without linearisation."""
+    pixels = image.pixels[..., min(channel, image.pixels.shape[2] - 1)]
+    height, width = pixels.shape
+    # KHR_texture_transform: uv' = translation * rotation * scale * uv, v downwards.
+    cosine, sine = np.cos(texture.rotation), np.sin(texture.rotation)
+    u, v = uv[:, 0] * texture.scale[0], uv[:, 1] * texture.scale[1]
+    x = (cosine * u + sine * v + texture.offset[0]) * width - 0.5
+    y = (-sine * u + cosine * v + texture.offset[1]) * height - 0.5
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    across, down = x - left, y - top
+    columns = [_wrapped(left + i, width, texture.wrap[0]) for i in (0, 1)]
+    rows = [_wrapped(top + i, height, texture.wrap[1]) for i in (0, 1)]
+    upper = pixels[rows[0], columns[0]] * (1.0 - across) + pixels[rows[0], columns[1]] * across
+    lower = pixels[rows[1], columns[0]] * (1.0 - across) + pixels[rows[1], columns[1]] * across
+    value = np.asarray(upper * (1.0 - down) + lower * down)
+    return value / 255.0 if image.pixels.dtype == np.uint8 else value
+
+
+def _wrapped(index: Ints, size: int, wrap: str) -> Ints:
+    if wrap == "repeat":
+        return np.mod(index, size)
+    if wrap == "mirror":
+        folded = np.mod(index, 2 * size)
+        return np.minimum(folded, 2 * size - 1 - folded)
+    return np.clip(index, 0, size - 1)
+
+
+def _alpha(scene: Scene, mesh: Ints, uv: Floats) -> Floats:
+    """GGX alpha [S] at points of meshes [S] with texture coordinates [S, 2]."""
+    out = np.zeros(len(mesh))
+    for index, part in enumerate(scene.meshes):
+        material = scene.materials[part.material]
+        mine = mesh == index
+        roughness = np.full(int(mine.sum()), material.roughness)
+        texture = material.metallic_roughness_texture
+        if texture is not None and part.uv is not None:
+            roughness *= sample_bilinear(scene.images[texture.image], texture, uv[mine], channel=1)
+        out[mine] = np.maximum(roughness**2, MIN_ALPHA)
+    return out
+
+
+class _AllFaces:
+    """The faces of all meshes in one list, in float64."""
+
+    def __init__(self, scene: Scene) -> None:
+        offsets = np.cumsum([0] + [len(mesh.positions) for mesh in scene.meshes])
+        self.positions = np.concatenate([mesh.positions for mesh in scene.meshes]).astype(np.float64)
+        self.normals = np.concatenate([mesh.normals for mesh in scene.meshes]).astype(np.float64)
+        self.uv = np.concatenate(
+            [np.zeros((len(mesh.positions), 2)) if mesh.uv is None else mesh.uv for mesh in scene.meshes]
+        ).astype(np.float64)
+        self.corners = np.concatenate(
+            [mesh.faces.astype(np.int64) + offset for mesh, offset in zip(scene.meshes, offsets, strict=False)]
+        )  # [F, 3]
+        self.mesh = np.repeat(np.arange(len(scene.meshes)), [len(mesh.faces) for mesh in scene.meshes])
+        self._flat_uv = np.concatenate([_lightmap_uv(mesh) for mesh in scene.meshes])
+        self.lightmap_uv = self._flat_uv[self.corners].astype(np.float64)  # [F, 3, 2]
+        self.normal = face_normals(self.positions, self.corners)
+
+    def texel_size(self, resolution: int) -> Floats:
+        """Metres along a texel's side for each face: the root of its area over its texels."""
+        area = face_areas(self.positions, self.corners)
+        a, b, c = (self.lightmap_uv[:, corner] * resolution for corner in range(3))
+        texels = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+        # A face of less than a hundredth of a texel is as good as one texel wide.
+        return np.asarray(np.sqrt(area / np.where(texels > 0.01, texels, 1.0)))
+
+    def charts(self) -> Ints:
+        """Chart number of each face: connected over edges whose ends agree in mesh, place and light-map UV."""
+        place = np.concatenate([self.positions.astype(np.float32), self._flat_uv], axis=1) + np.float32(0.0)
+        key = np.ascontiguousarray(place).view(np.int32).reshape(len(place), -1)
+        owner = np.zeros(len(place), dtype=np.int32)
+        owner[self.corners] = self.mesh[:, None]
+        _, vertex = np.unique(np.column_stack([owner, key]), axis=0, return_inverse=True)
+        corners = vertex.reshape(-1)[self.corners]
+        edges = np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        _, edge = np.unique(edges, axis=0, return_inverse=True)
+        face = np.repeat(np.arange(len(corners)), 3)
+        # Faces and edges are the two sides of a bipartite graph.
+        count = len(corners) + int(edge.max()) + 1
+        graph = coo_array((np.ones(len(face), np.int8), (face, edge.reshape(-1) + len(corners))), shape=(count, count))
+        return np.asarray(connected_components(graph, directed=False)[1][: len(corners)], dtype=np.int64)
+
+
+def _lightmap_uv(mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    if mesh.lightmap_uv is None:
+        raise InputError("has no light-map UV", where=f"mesh '{mesh.name}'", remedy="Assign one first.")
+    return mesh.lightmap_uv
