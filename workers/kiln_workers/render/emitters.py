@@ -7,19 +7,17 @@ textures repeat and overlap. This one samples the surface uniformly and looks th
 from functools import lru_cache
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 
 def register_emitters() -> None:
     """Make `kiln_area` known to the selected Mitsuba variant (once per variant)."""
-    import mitsuba as mi
-
     _register(mi.variant())
 
 
 @lru_cache(maxsize=4)
 def _register(variant: str) -> None:
-    import drjit as dr
-    import mitsuba as mi
-
     class KilnArea(mi.Emitter):  # type: ignore[misc]
         """One-sided area emitter: `radiance` and, optionally, `opacity` are textures."""
 

@@ -9,10 +9,13 @@ back. Spot lights fall off linearly in the angle between their cones, which glTF
 
 from typing import Any, Final
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from kiln_workers.render import textures
 from kiln_workers.render.backend import select_variant
+from kiln_workers.render.emitters import register_emitters
 from kiln_workers.scene.model import Environment, Float32, LightKind, Material, Mesh, PunctualLight, Scene
 
 MIN_ROUGHNESS: Final = 0.05
@@ -24,12 +27,8 @@ SHEET_GAP: Final = 1e-6
 
 def to_mitsuba(scene: Scene) -> Any:
     """The `mi.Scene` of a parsed scene (variant: the one selected, else `select_variant()`'s choice)."""
-    import mitsuba as mi
-
     if mi.variant() is None:
         select_variant()
-    from kiln_workers.render.emitters import register_emitters
-
     register_emitters()
     powers = _EmitterPowers(scene)
     parts: dict[str, Any] = {"type": "scene"}
@@ -51,6 +50,11 @@ def to_mitsuba(scene: Scene) -> Any:
     if scene.environment is not None:
         parts["environment"] = _environment(scene.environment, powers.environment_weight())
     return mi.load_dict(parts)
+
+
+def mesh_number(shape: Any) -> int:
+    """Index in `Scene.meshes` of a shape of `to_mitsuba`'s scene."""
+    return int(shape.id().split("_")[1])
 
 
 def scene_bounds(scene: Scene) -> tuple[Float32, Float32]:
@@ -142,9 +146,6 @@ def _needs_uv_range(material: Material) -> bool:
 
 
 def _mesh(mesh: Mesh, material: Material, bsdf: Any, emitter: Any | None) -> Any:
-    import drjit as dr
-    import mitsuba as mi
-
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     if emitter is not None:
@@ -204,8 +205,6 @@ def opacity(scene: Scene, material: Material, uv: Float32 | None) -> Any:
 
 
 def _emission(scene: Scene, material: Material, mesh: Mesh, weight: float) -> Any | None:
-    import mitsuba as mi
-
     if max(material.emission) <= 0.0:
         return None
     radiance: dict[str, Any] = {"type": "rgb", "value": list(material.emission)}
@@ -228,8 +227,6 @@ def _emission(scene: Scene, material: Material, mesh: Mesh, weight: float) -> An
 
 
 def _light(light: PunctualLight, weight: float) -> dict[str, Any]:
-    import mitsuba as mi
-
     intensity = {"type": "rgb", "value": list(light.intensity)}
     if light.kind is LightKind.DIRECTIONAL:
         direction = list(light.direction)
@@ -252,8 +249,6 @@ def _light(light: PunctualLight, weight: float) -> dict[str, Any]:
 
 
 def _environment(environment: Environment, weight: float) -> dict[str, Any]:
-    import mitsuba as mi
-
     turn = mi.ScalarTransform4f().rotate([0.0, 1.0, 0.0], environment.rotation_deg)
     return {
         "type": "envmap",

@@ -9,6 +9,7 @@ KHR_texture_transform scales, then rotates counter-clockwise as seen on the imag
 import math
 from typing import Any, Final
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 from kiln_schemas.errors import TooLarge
@@ -53,8 +54,6 @@ def uv_matrix(reference: TextureRef) -> Floats:
 
 def bitmap(pixels: Float32, reference: TextureRef, uv: Float32 | None, nearest: bool = False) -> dict[str, Any]:
     """A Mitsuba `bitmap` of linear `pixels` [H, W, 1 or 3] as `reference` looks it up for coordinates `uv` [V, 2]."""
-    import mitsuba as mi
-
     matrix = uv_matrix(reference)
     wrap = reference.wrap[0]
     if reference.wrap[0] != reference.wrap[1]:

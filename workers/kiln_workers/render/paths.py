@@ -1,0 +1,246 @@
+"""The path tracer: incident radiance of pixels of local light fields, and irradiance, in wavefronts of lanes.
+
+A lane computes one pixel of one texel's image (or one block of a texel's irradiance samples): it takes its samples one
+after another, a new path starting as soon as the last has ended, and adds them in order to its own registers. So no
+atomics are needed and a result depends on nothing but its own random numbers. Paths use next-event estimation and BSDF
+sampling weighted by the power heuristic (Veach 1997, section 9.2.4) and Russian roulette from the fourth scattering on.
+Deviations from Mitsuba's `path` integrator: directions on the wrong side of the geometric surface carry nothing, where
+the interpolated normal faces away from the ray the geometric one is used, and cut-outs do not block shadow rays.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from kiln_workers.render import counters
+from kiln_workers.render.mitsuba_scene import mesh_number, scene_bounds, scene_diagonal, to_mitsuba
+from kiln_workers.scene.model import Scene
+
+ROULETTE_FROM: Final = 3
+"""Scattering events that a path makes before roulette may end it."""
+
+MAX_LAYERS: Final = 64
+"""Cut-out surfaces that one ray passes, at most."""
+
+TEXEL_OFFSET: Final = 1e-3
+"""Rays leave a texel this fraction of its size above the surface (or the rounding error, if larger)."""
+
+OPACITY_THRESHOLD: Final = 0.5
+"""Opacities are 0 or 1 (`textures.thresholded`)."""
+
+
+@dataclass
+class Start:
+    """The first ray of a path."""
+
+    origin: Any  # Point3f
+    direction: Any  # Vector3f
+    weight: Any  # Float: factor on the path's radiance
+    pdf: Any  # Float: density of `direction` for the weight against next-event estimation at the texel; 0: no such
+    used: Any  # Bool: False for directions below the horizon, which carry nothing and are not traced
+
+
+@dataclass
+class LaneSums:
+    """What a lane has added up over its samples."""
+
+    radiance: Any  # Color3f: sum of weight times radiance
+    weight: Any  # Float: sum of the weights of samples in use
+    back_faces: Any  # UInt32: paths whose first hit is the back of a single-sided surface
+    dropped: Any  # UInt32: paths that were not finite
+
+
+class PathTracer:
+    """A scene ready to be traced: Mitsuba's scene, offsets against self-intersection, and which surfaces are thin."""
+
+    def __init__(self, scene: Scene, max_depth: int) -> None:
+        self.scene = to_mitsuba(scene)
+        self.max_depth = max_depth
+        self.has_cutouts = any(scene.materials[mesh.material].alpha_cutoff is not None for mesh in scene.meshes)
+        self.has_emitters = len(self.scene.emitters()) > 0
+        low, high = scene_bounds(scene)
+        # Embree's and our own rounding grow with the size of triangles and with the distance from the origin.
+        self.rounding = 2e-6 * scene_diagonal(scene) + 4e-6 * float(np.abs(np.stack([low, high])).max())
+        self.double_sided = self._double_sided_table(scene)
+
+    def _double_sided_table(self, scene: Scene) -> Any:
+        """UInt32 by Dr.Jit's identifier of the shape: 1 where the material is double-sided."""
+        shapes = self.scene.shapes()
+        identifiers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+        table = np.zeros(max(identifiers, default=0) + 1, np.uint32)
+        for shape, identifier in zip(shapes, identifiers, strict=True):
+            table[identifier] = scene.materials[scene.meshes[mesh_number(shape)].material].double_sided
+        return mi.UInt32(table)
+
+    def leave(self, position: Any, normal: Any, direction: Any) -> Any:
+        """Origin [Point3f] of a ray that leaves a surface point towards `direction`."""
+        return mi.Point3f(position + dr.mulsign(self.rounding, dr.dot(normal, direction)) * normal)
+
+    @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
+    def closest(self, ray: Any, active: Any) -> Any:
+        """The first opaque hit: Mitsuba's SurfaceInteraction3f, invalid where the ray leaves the scene."""
+        si = self.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        if dr.hint(self.has_cutouts, mode="scalar"):
+            layers = mi.UInt32(0)
+            through = active & si.is_valid() & (self._opacity(si, active) < OPACITY_THRESHOLD)
+            while through:
+                onwards = mi.Ray3f(self.leave(si.p, si.n, ray.d), ray.d, ray.maxt, ray.time, ray.wavelengths)
+                onwards.maxt = ray.maxt - dr.norm(onwards.o - ray.o)
+                behind = self.scene.ray_intersect(onwards, mi.RayFlags.All, False, through)
+                si = dr.select(through, behind, si)
+                layers += 1
+                through &= si.is_valid() & (self._opacity(si, through) < OPACITY_THRESHOLD) & (layers < MAX_LAYERS)
+        return si
+
+    def _opacity(self, si: Any, active: Any) -> Any:
+        return 1.0 - dr.mean(si.bsdf().eval_null_transmission(si, active))
+
+    def occluded(self, origin: Any, target: Any, active: Any) -> Any:
+        """Whether an opaque surface lies between two points."""
+        segment = target - origin
+        distance = dr.norm(segment)
+        ray = mi.Ray3f(origin, segment / distance)
+        ray.maxt = distance * (1.0 - 1e-4)
+        return self.blocked(ray, active)
+
+    def blocked(self, ray: Any, active: Any) -> Any:
+        """Whether the ray meets an opaque surface before its `maxt`."""
+        if not self.has_cutouts:
+            return self.scene.ray_test(ray, active)
+        return self.closest(ray, active).is_valid()
+
+    def light_at(self, si: Any, origin: Any, sample: Any, active: Any) -> tuple[Any, Any]:
+        """Next-event estimation: direction sample and unoccluded radiance / pdf (0 where occluded)."""
+        ds, weight = self.scene.sample_emitter_direction(si, sample, False, active)
+        active = active & (ds.pdf != 0.0) & (dr.max(weight) > 0.0)
+        active &= ~self.occluded(self.leave(origin, si.n, ds.d), ds.p, active)
+        return ds, dr.select(active, weight, 0.0)
+
+    @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
+    def trace(self, lanes: Any, samples: Any, start: Callable[[Any, Any], Start], sees_environment: bool) -> LaneSums:
+        """Sums over `samples` [UInt32 a lane] paths a lane that begin as `start(sample state, sample)` says.
+
+        `lanes`: UInt64 states. The environment counts at the first ray only with `sees_environment`.
+        """
+        width = dr.width(lanes)
+        zeros = dr.zeros(mi.UInt32, width)
+        radiance, weight_sum = dr.zeros(mi.Color3f, width), dr.zeros(mi.Float, width)
+        back_faces, dropped, sample, depth = mi.UInt32(zeros), mi.UInt32(zeros), mi.UInt32(zeros), mi.UInt32(zeros)
+        state = mi.UInt64(lanes)
+        origin, direction = dr.zeros(mi.Point3f, width), dr.zeros(mi.Vector3f, width)
+        before, before_pdf = dr.zeros(mi.Point3f, width), dr.zeros(mi.Float, width)
+        path_weight = dr.zeros(mi.Float, width)
+        throughput, path_radiance = dr.zeros(mi.Color3f, width), dr.zeros(mi.Color3f, width)
+        on_path = dr.zeros(mi.Bool, width)
+        running = mi.Bool(samples > 0)
+        context = mi.BSDFContext()
+
+        while running:
+            # Begin the next path in every lane that is between paths.
+            fresh = ~on_path
+            state = dr.select(fresh, counters.sample_state(lanes, sample), state)
+            first = start(lanes, sample)
+            on_path |= first.used
+            origin, direction = dr.select(fresh, first.origin, origin), dr.select(fresh, first.direction, direction)
+            before, before_pdf = dr.select(fresh, first.origin, before), dr.select(fresh, first.pdf, before_pdf)
+            path_weight = dr.select(fresh, first.weight, path_weight)
+            throughput, path_radiance = dr.select(fresh, 1.0, throughput), dr.select(fresh, 0.0, path_radiance)
+            depth = dr.select(fresh, 0, depth)
+
+            ray = mi.Ray3f(origin, direction)
+            si = self.closest(ray, on_path)
+            self._orient(si, ray)
+            thin = dr.gather(mi.UInt32, self.double_sided, dr.reinterpret_array(mi.UInt32, si.shape), si.is_valid())
+            behind = si.is_valid() & (dr.dot(si.n, direction) > 0.0) & (thin == 0)
+            back_faces += dr.select(on_path & behind & (depth == 0), 1, 0)
+
+            # Radiance emitted at the hit (or by the environment), weighted against next-event estimation.
+            reference = dr.zeros(mi.Interaction3f)
+            reference.p = before
+            seen = mi.DirectionSample3f(self.scene, si, reference)
+            sampled = on_path & (before_pdf > 0.0)
+            light_pdf = self.scene.pdf_emitter_direction(reference, seen, sampled)
+            emits = on_path & (si.is_valid() | (depth > 0) | sees_environment)
+            emitted = seen.emitter.eval(si, emits)
+            path_radiance += (
+                throughput
+                * dr.select(emits, emitted, 0.0)
+                * _power_heuristic(before_pdf, dr.select(sampled, light_pdf, 0.0))
+            )
+
+            # Light that arrives at the hit straight from an emitter.
+            scatters = on_path & si.is_valid() & (depth < self.max_depth) & ~behind
+            bsdf = si.bsdf()
+            state, u = counters.pair(state)
+            ds, arriving = self.light_at(si, si.p, u, scatters)
+            local = si.to_local(ds.d)
+            value, pdf = bsdf.eval_pdf(context, si, local, scatters)
+            same_side = dr.dot(si.n, ds.d) * dr.dot(si.n, direction) < 0.0
+            share = dr.select(ds.delta, 1.0, _power_heuristic(ds.pdf, pdf))
+            path_radiance += dr.select(scatters & same_side, throughput * value * arriving * share, 0.0)
+
+            # Continue in a direction drawn from the BSDF.
+            state, u = counters.pair(state)
+            state, choice = counters.pair(state)
+            scattered, factor = bsdf.sample(context, si, choice.x, u, scatters)
+            onwards = si.to_world(scattered.wo)
+            scatters &= dr.dot(si.n, onwards) * dr.dot(si.n, direction) < 0.0
+            throughput *= factor
+            largest = dr.max(throughput)
+            survival = dr.select(depth >= ROULETTE_FROM, dr.minimum(largest, 0.95), 1.0)
+            survives = scatters & (largest > 0.0) & (choice.y < survival)
+            throughput = dr.select(survives, throughput / survival, throughput)
+
+            # Finish the path, or move on to its next vertex.
+            ends = ~survives
+            finite = dr.all(dr.isfinite(path_radiance))
+            counted = on_path & ends
+            radiance += dr.select(counted & finite, path_weight * path_radiance, 0.0)
+            weight_sum += dr.select(counted & finite, path_weight, 0.0)
+            dropped += dr.select(counted & ~finite, 1, 0)
+            sample += dr.select(ends, 1, 0)
+            on_path = survives & running
+            before, before_pdf = mi.Point3f(si.p), mi.Float(scattered.pdf)
+            origin, direction = self.leave(si.p, si.n, onwards), mi.Vector3f(onwards)
+            depth += 1
+            running = on_path | (sample < samples)
+
+        return LaneSums(radiance, weight_sum, back_faces, dropped)
+
+    @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
+    def direct(self, lanes: Any, samples: Any, position: Any, normal: Any, shading_normal: Any) -> Any:
+        """Sum [Color3f] over `samples` next-event estimates of the irradiance at points of a surface.
+
+        Weighted against cosine-distributed paths that see the environment, which `trace` takes.
+        """
+        total = dr.zeros(mi.Color3f, dr.width(lanes))
+        sample = dr.zeros(mi.UInt32, dr.width(lanes))
+        at = dr.zeros(mi.SurfaceInteraction3f)
+        at.p, at.n = position, mi.Normal3f(normal)
+        at.sh_frame = mi.Frame3f(at.n)
+        while sample < samples:
+            active = sample < samples
+            ds, arriving = self.light_at(at, position, counters.stratified_pair(lanes, sample), active)
+            cosine = dr.dot(shading_normal, ds.d)
+            above = (cosine > 0.0) & (dr.dot(normal, ds.d) > 0.0)
+            share = dr.select(ds.delta, 1.0, _power_heuristic(ds.pdf, cosine * dr.inv_pi))
+            arriving = arriving * cosine * share
+            total += dr.select(above & dr.all(dr.isfinite(arriving)), arriving, 0.0)
+            sample += 1
+        return total
+
+    def _orient(self, si: Any, ray: Any) -> None:
+        """Replace an interpolated normal that faces away from the ray while the surface faces it, or vice versa."""
+        turned = dr.dot(si.sh_frame.n, ray.d) * dr.dot(si.n, ray.d) <= 0.0
+        si.sh_frame = dr.select(turned, mi.Frame3f(si.n), si.sh_frame)
+        si.wi = dr.select(turned & si.is_valid(), si.to_local(-ray.d), si.wi)
+
+
+def _power_heuristic(own: Any, other: Any) -> Any:
+    """Weight of a sample drawn with density `own` where another technique has density `other`; 1 for other = 0."""
+    square = own * own
+    return dr.select(other > 0.0, square / dr.fma(other, other, square), 1.0)

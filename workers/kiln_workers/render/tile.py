@@ -1,0 +1,228 @@
+"""Render the texels of a tile: light-field images, environment visibility, irradiance, within a memory bound.
+
+The unit of work is a lane (see `paths`): pixels whose square lies wholly or partly above a texel's geometric horizon.
+A pixel holds the mean radiance, by solid angle, over the part of it that is above the horizon; a pixel with no such
+part is zero. Lanes are listed texel by texel and cut into wavefronts of as many as the memory bound holds, which
+changes no byte of the result.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+from kiln_schemas.conventions import FP16_MAX
+from kiln_schemas.errors import MachineLacks
+from kiln_schemas.settings import RenderSettings
+
+from kiln_workers.render import counters
+from kiln_workers.render.backend import Device, select_variant
+from kiln_workers.render.paths import TEXEL_OFFSET, LaneSums, PathTracer, Start
+from kiln_workers.scene.model import Float32, Scene
+from kiln_workers.sphere import octahedral
+
+Float16 = npt.NDArray[np.float16]
+Int64 = npt.NDArray[np.int64]
+
+BYTES_PER_LANE: Final = 160
+"""Inputs, outputs and their copies in NumPy, per lane of a wavefront (measured by benchmarks/render.py)."""
+
+LARGEST_WAVEFRONT: Final = 1 << 22
+SMALLEST_WAVEFRONT: Final = 1 << 12
+
+IRRADIANCE_BLOCK: Final = 16
+"""Irradiance samples per lane: few, so that the few texels of a tile fill many lanes."""
+
+
+@dataclass(frozen=True)
+class TexelBatch:
+    """T surface points to be baked."""
+
+    index: Int64  # [T] row * W + column in the light map: with the scene's hash it seeds the texel's random numbers
+    position: Float32  # [T, 3] metres
+    normal: Float32  # [T, 3] unit, geometric, on the side that light reaches
+    shading_normal: Float32  # [T, 3] unit
+    alpha: Float32  # [T] GGX alpha
+    texel_size: Float32  # [T] metres
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+@dataclass(frozen=True)
+class TileImages:
+    """What was rendered for the T texels of a batch, R = image_size."""
+
+    light_field: Float16  # [T, R, R, 3] radiance without the directly seen environment
+    visibility: Float16 | None  # [T, R, R, 3] W_E; None without an environment
+    irradiance: Float32  # [T, 3] W/m^2, over the shading normal's hemisphere above the surface
+    back_faces: Float32  # [T] fraction of primary rays that meet the back of a single-sided surface
+    paths: int
+    overflows: int  # values clamped to the fp16 range, and paths dropped because they were not finite
+
+
+class TileRenderer:
+    """Renders batches of texels of one scene; keep it while the scene stays the same."""
+
+    def __init__(
+        self, scene: Scene, scene_hash: str, settings: RenderSettings, memory_bytes: int, device: Device = "auto"
+    ) -> None:
+        select_variant(device)
+        self.settings = settings
+        self.key = int(scene_hash[:16], 16)
+        self.tracer = PathTracer(scene, settings.max_depth)
+        self.wavefront = wavefront_lanes(memory_bytes)
+        self.pixel_area = 4.0 / settings.image_size**2
+        self.solid_angles = mi.Float(octahedral.pixel_solid_angles(settings.image_size).astype(np.float32).ravel())
+
+    def render(self, texels: TexelBatch, on_progress: Callable[[float], None] | None = None) -> TileImages:
+        """All images of the batch; `on_progress` is called with the fraction done and may raise to stop."""
+        report = on_progress or (lambda fraction: None)
+        light_field, back_faces, paths, overflows = self._light_fields(texels, lambda f: report(0.7 * f))
+        irradiance, irradiance_paths, dropped = self._irradiance(texels, lambda f: report(0.7 + 0.3 * f))
+        return TileImages(
+            light_field=light_field,
+            visibility=None,
+            irradiance=irradiance,
+            back_faces=back_faces,
+            paths=paths + irradiance_paths,
+            overflows=overflows + dropped,
+        )
+
+    def _light_fields(self, texels: TexelBatch, report: Callable[[float], None]) -> tuple[Float16, Float32, int, int]:
+        size, samples = self.settings.image_size, self.settings.samples
+        out = np.zeros((len(texels), size * size, 3), np.float16)
+        back = np.zeros(len(texels), np.int64)
+        hits = np.zeros(len(texels), np.int64)
+        overflows = 0
+        lanes = lanes_above_horizon(texels.normal, size)
+        for part, fraction in self._wavefronts(lanes):
+            texel, pixel = part[:, 0], part[:, 1]
+            sums = self._trace_pixels(texels, texel, pixel, samples)
+            weight = np.array(sums.weight)
+            mean = np.array(sums.radiance).T / np.maximum(weight, 1e-30)[:, None]
+            values, clamped = to_half(mean)
+            out[texel, pixel] = values
+            back += np.bincount(texel, weights=np.array(sums.back_faces), minlength=len(texels)).astype(np.int64)
+            hits += np.bincount(texel, minlength=len(texels)) * samples
+            overflows += clamped + int(np.array(sums.dropped).sum())
+            report(fraction)
+        fractions = (back / np.maximum(hits, 1)).astype(np.float32)
+        return out.reshape(len(texels), size, size, 3), fractions, len(lanes) * samples, overflows
+
+    def _trace_pixels(self, texels: TexelBatch, texel: Int64, pixel: Int64, samples: int) -> LaneSums:
+        """One wavefront of light-field pixels."""
+        size = self.settings.image_size
+        points = _Points(texels, texel, self.tracer.rounding)
+        pixels = mi.UInt32(pixel.astype(np.uint32))
+        corner = mi.Vector2f(mi.Float(pixels % size), mi.Float(pixels // size))
+        density = self.pixel_area / dr.gather(mi.Float, self.solid_angles, pixels)
+        lanes = counters.lane_state(self.key, counters.STREAM_LIGHT_FIELD, points.index, pixels)
+        dr.eval(lanes, corner, density, points.origin, points.normal)
+
+        def start(lane: Any, sample: Any) -> Start:
+            xy = (corner + counters.stratified_pair(lane, sample)) * (2.0 / size) - 1.0
+            direction, jacobian = octahedral_direction(xy)
+            return Start(points.origin, direction, jacobian * density, 0.0, dr.dot(direction, points.normal) > 0.0)
+
+        count = dr.full(mi.UInt32, samples, len(texel))
+        sums = self.tracer.trace(lanes, count, start, False)
+        dr.eval(sums.radiance, sums.weight, sums.back_faces, sums.dropped)
+        return sums
+
+    def _irradiance(self, texels: TexelBatch, report: Callable[[float], None]) -> tuple[Float32, int, int]:
+        samples = self.settings.irradiance_samples
+        blocks = -(-samples // IRRADIANCE_BLOCK)
+        total = np.zeros((len(texels), blocks, 3), np.float64)
+        dropped = 0
+        grid = np.stack(np.meshgrid(np.arange(len(texels)), np.arange(blocks), indexing="ij"), axis=-1).reshape(-1, 2)
+        for part, fraction in self._wavefronts(grid):
+            texel, block = part[:, 0], part[:, 1]
+            counts = np.minimum(samples - block * IRRADIANCE_BLOCK, IRRADIANCE_BLOCK)
+            paths, direct = self._trace_irradiance(texels, texel, block, counts)
+            # Sum each texel's blocks in one fixed order, whatever the wavefronts were.
+            total[texel, block] = np.array(paths.radiance).T + np.array(direct).T
+            dropped += int(np.array(paths.dropped).sum())
+            report(fraction)
+        return (total.sum(axis=1) / samples).astype(np.float32), len(texels) * samples, dropped
+
+    def _trace_irradiance(self, texels: TexelBatch, texel: Int64, block: Int64, counts: Int64) -> tuple[LaneSums, Any]:
+        """One wavefront of blocks of irradiance samples: cosine-distributed paths, and next-event estimates."""
+        points = _Points(texels, texel, self.tracer.rounding)
+        blocks, count = mi.UInt32(block.astype(np.uint32)), mi.UInt32(counts.astype(np.uint32))
+        # The texel's samples form one low-discrepancy set over all of its blocks.
+        shared = counters.lane_state(self.key, counters.STREAM_IRRADIANCE, points.index, mi.UInt32(0))
+        lanes = counters.lane_state(self.key, counters.STREAM_IRRADIANCE, points.index, blocks + 1)
+        frame = mi.Frame3f(points.shading_normal)
+        first = blocks * IRRADIANCE_BLOCK
+        dr.eval(shared, lanes, first, frame, points.origin, points.normal)
+
+        def start(lane: Any, sample: Any) -> Start:
+            local = mi.warp.square_to_cosine_hemisphere(counters.stratified_pair(shared, first + sample))
+            direction = frame.to_world(local)
+            pdf = mi.warp.square_to_cosine_hemisphere_pdf(local)
+            # The estimator L cos / pdf is pi L.
+            return Start(points.origin, direction, dr.pi, pdf, dr.dot(direction, points.normal) > 0.0)
+
+        paths = self.tracer.trace(lanes, count, start, True)
+        direct_lanes = counters.lane_state(self.key, counters.STREAM_DIRECT, points.index, blocks)
+        direct = self.tracer.direct(direct_lanes, count, points.origin, points.normal, points.shading_normal)
+        dr.eval(paths.radiance, paths.dropped, direct)
+        return paths, direct
+
+    def _wavefronts(self, lanes: Int64) -> Iterator[tuple[Int64, float]]:
+        for first in range(0, len(lanes), self.wavefront):
+            part = lanes[first : first + self.wavefront]
+            yield part, (first + len(part)) / len(lanes)
+
+
+class _Points:
+    """A wavefront's texels as Dr.Jit arrays, one entry a lane; origins already lifted off the surface."""
+
+    def __init__(self, texels: TexelBatch, texel: Int64, rounding: float) -> None:
+        lift = np.maximum(TEXEL_OFFSET * texels.texel_size, np.float32(rounding))[:, None]
+        origin = (texels.position + lift * texels.normal).astype(np.float32)
+        self.index = mi.UInt64(texels.index[texel].astype(np.uint64))
+        self.origin = mi.Point3f(np.ascontiguousarray(origin[texel].T))
+        self.normal = mi.Vector3f(np.ascontiguousarray(texels.normal[texel].T))
+        self.shading_normal = mi.Vector3f(np.ascontiguousarray(texels.shading_normal[texel].T))
+
+
+def wavefront_lanes(memory_bytes: int) -> int:
+    """Lanes of a wavefront that keeps within `memory_bytes`; MachineLacks where not even a small one does."""
+    lanes = min(memory_bytes // BYTES_PER_LANE, LARGEST_WAVEFRONT)
+    if lanes < SMALLEST_WAVEFRONT:
+        raise MachineLacks(
+            f"{memory_bytes} bytes hold {lanes} rays",
+            where="memory",
+            remedy=f"Allow at least {SMALLEST_WAVEFRONT * BYTES_PER_LANE >> 20 or 1} MiB.",
+        )
+    return int(lanes)
+
+
+def lanes_above_horizon(normals: Float32, size: int) -> Int64:
+    """(texel, pixel) [L, 2] of every pixel with a corner above the texel's horizon, by texel, then by pixel."""
+    edges = np.linspace(-1.0, 1.0, size + 1)
+    corners = octahedral.decode(np.stack(np.broadcast_arrays(edges[None, :], edges[:, None]), axis=-1))
+    # A pixel's lowest and highest points are its corners: straight edges on a face are great circles.
+    height = np.einsum("rcd,td->trc", corners, normals.astype(np.float64)) > 0.0
+    above = height[:, :-1, :-1] | height[:, :-1, 1:] | height[:, 1:, :-1] | height[:, 1:, 1:]
+    return np.argwhere(above.reshape(len(normals), -1))
+
+
+def octahedral_direction(xy: Any) -> tuple[Any, Any]:
+    """`sphere.octahedral.decode` and `jacobian` of a Point2f in [-1, 1]^2, in Dr.Jit."""
+    z = 1.0 - dr.abs(xy.x) - dr.abs(xy.y)
+    fold = dr.maximum(-z, 0.0)
+    p = mi.Vector3f(xy.x - dr.mulsign(fold, xy.x), xy.y - dr.mulsign(fold, xy.y), z)
+    inverse = dr.rsqrt(dr.squared_norm(p))
+    return p * inverse, inverse * inverse * inverse
+
+
+def to_half(values: Float32) -> tuple[Float16, int]:
+    """Values as fp16, clamped to its range, and how many had to be."""
+    clamped = int(np.count_nonzero(values > FP16_MAX))
+    return np.minimum(values, FP16_MAX).astype(np.float16), clamped
