@@ -38,6 +38,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         version=__version__,
         summary="Distributed bakes of spherical Gaussian light-field textures",
         lifespan=lambda app: _lifespan(app, config),
+        generate_unique_id_function=lambda route: route.name,
         openapi_url=None,
         docs_url=None,
         redoc_url=None,

@@ -15,6 +15,7 @@ from kiln_schemas.tasks import Bundle, Result
 from psycopg.types.json import Jsonb
 
 from kiln_service import queue
+from kiln_service.blobs import drop_blobs
 from kiln_service.db import JobRow, TaskRow, Tx, WorkerRow
 from kiln_service.events import add_event
 from kiln_service.ids import new_id
@@ -105,7 +106,7 @@ async def complete_task(tx: Tx, task: TaskRow, result: Result) -> None:
     """active > completed."""
     check_task_move(task.state, TaskState.COMPLETED)
     await _move(tx, "move_task_completed", task, result=Jsonb(result.model_dump(mode="json")))
-    await queue.finish(tx, task.queue_job)
+    await _leave_queue(tx, task)
     await _task_event(tx, task, "task.completed", f"worker:{task.worker_id}", {"seconds": result.seconds})
 
 
@@ -113,7 +114,7 @@ async def fail_task(tx: Tx, job: JobRow, task: TaskRow, problem: Problem, actor:
     """active > failed, and the job with it; returns the queue jobs to withdraw afterwards."""
     check_task_move(task.state, TaskState.FAILED)
     await _move(tx, "move_task_ended", task, after=TaskState.FAILED, error=Jsonb(problem.model_dump(mode="json")))
-    await queue.finish(tx, task.queue_job)
+    await _leave_queue(tx, task)
     await _task_event(tx, task, "task.failed", actor, {"problem": problem.model_dump(mode="json")})
     return await fail_job(tx, job, problem, actor)
 
@@ -122,7 +123,7 @@ async def cancel_task(tx: Tx, task: TaskRow, actor: str, reason: str) -> None:
     """active > canceled: its worker was told to stop, or is lost."""
     check_task_move(task.state, TaskState.CANCELED)
     await _move(tx, "move_task_ended", task, after=TaskState.CANCELED, error=None)
-    await queue.finish(tx, task.queue_job)
+    await _leave_queue(tx, task)
     await _task_event(tx, task, "task.canceled", actor, {"reason": reason})
 
 
@@ -132,6 +133,9 @@ async def cancel_idle_tasks(tx: Tx, job: JobRow, actor: str) -> list[int]:
     for state in before:
         check_task_move(state, TaskState.CANCELED)
     rows = await tx.all("cancel_idle_tasks", job_id=job.id, before=[state.value for state in before])
+    for row in rows:
+        if row["checkpoint"] is not None:
+            await drop_blobs(tx, f"checkpoint:{row['id']}")
     if rows:
         await add_event(tx, job.id, "tasks.canceled", actor, detail={"count": len(rows)})
     return [row["queue_job"] for row in rows if row["queue_job"] is not None]
@@ -168,6 +172,12 @@ async def fail_job(tx: Tx, job: JobRow, problem: Problem, actor: str) -> list[in
     idle = await cancel_idle_tasks(tx, job, actor)
     await move_job(tx, job, JobState.FAILED, actor, error=problem)
     return idle
+
+
+async def _leave_queue(tx: Tx, task: TaskRow) -> None:
+    """A task that is over has no queue job and needs no checkpoint."""
+    await queue.finish(tx, task.queue_job)
+    await drop_blobs(tx, f"checkpoint:{task.id}")
 
 
 async def _move(tx: Tx, query: str, task: TaskRow, **parameters: Any) -> None:

@@ -155,7 +155,6 @@ class Work:
         made = _blobs_of(result)
         await _require(tx, made)
         await use_blobs(tx, f"result:{task.id}", made)
-        await drop_blobs(tx, f"checkpoint:{task.id}")
         await transitions.complete_task(tx, task, result)
         if isinstance(result, PrepareResult):
             await tx.run("add_notes", id=job.id, notes=Jsonb(list(result.notes)))

@@ -1,5 +1,7 @@
 """Routes of blobs: ask which are missing, upload, download."""
 
+from typing import Any, Final
+
 from fastapi import APIRouter, Depends, Request, Response
 from kiln_schemas.errors import InputError
 from kiln_schemas.job import MissingReply, MissingRequest
@@ -37,19 +39,23 @@ async def upload(sha256: Sha256Path, request: Request, parts: PartsHere) -> Resp
     return Response(status_code=201, headers={"ETag": f'"{sha256}"'})
 
 
-@router.api_route(
-    "/{sha256}",
-    methods=["GET", "HEAD"],
-    dependencies=[Downloader],
-    response_class=Response,
-    responses=problems(404, 416)
+_DOWNLOAD: Final[dict[str, Any]] = {
+    "dependencies": [Downloader],
+    "response_class": Response,
+    "responses": problems(404, 416)
     | {
         200: {"description": "The bytes", "content": {"application/octet-stream": {}}},
         206: {"description": "The range asked for"},
         304: {"description": "The client has it"},
     },
-)
+}
+
+
+@router.head("/{sha256}", operation_id="download_head", **_DOWNLOAD)
+@router.get("/{sha256}", **_DOWNLOAD)
 async def download(sha256: Sha256Path, request: Request, parts: PartsHere) -> Response:
     """Download a blob, whole or a range of it."""
+    if request.method == "HEAD":
+        await parts.blobs.missing([sha256])  # who asks is about to rely on it: not collected within the grace period
     size = await parts.blobs.size(sha256)
     return serve_blob(request, parts.blobs, sha256, size, "application/octet-stream")

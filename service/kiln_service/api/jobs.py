@@ -1,6 +1,6 @@
 """Routes of jobs, their tasks, events and artifacts."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
@@ -111,18 +111,20 @@ async def artifacts(job_id: str, parts: PartsHere) -> tuple[Artifact, ...]:
     return await views.artifacts(parts.database, job_id)
 
 
-@router.api_route(
-    "/jobs/{job_id}/artifacts/{name:path}",
-    methods=["GET", "HEAD"],
-    dependencies=[Reader],
-    response_class=Response,
-    responses=problems(404, 416)
+_ARTIFACT: Final[dict[str, Any]] = {
+    "dependencies": [Reader],
+    "response_class": Response,
+    "responses": problems(404, 416)
     | {
         200: {"description": "The file; its ETag is the sha256", "content": {"application/octet-stream": {}}},
         206: {"description": "The range asked for"},
         304: {"description": "The client has it"},
     },
-)
+}
+
+
+@router.head("/jobs/{job_id}/artifacts/{name:path}", operation_id="artifact_head", **_ARTIFACT)
+@router.get("/jobs/{job_id}/artifacts/{name:path}", **_ARTIFACT)
 async def artifact(job_id: str, name: str, request: Request, parts: PartsHere) -> Response:
     """Download an artifact, whole or a range of it."""
     found = await views.artifact(parts.database, job_id, name)

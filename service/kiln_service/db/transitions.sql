@@ -59,4 +59,4 @@ WHERE id = %(id)s AND state = %(before)s;
 UPDATE tasks
 SET state = 'canceled', finished = now()
 WHERE job_id = %(job_id)s AND state = ANY(%(before)s)
-RETURNING id, queue_job;
+RETURNING id, queue_job, checkpoint;

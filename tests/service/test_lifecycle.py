@@ -1,0 +1,129 @@
+"""A job from its submission to its artifacts, and what clients see of it on the way."""
+
+
+def test_a_job_runs_through_all_stages(home):
+    job = home.submit()
+    assert job["state"] == "queued" and [s["kind"] for s in job["stages"]] == ["prepare"]
+    worker = home.worker()
+
+    claim = worker.must_claim()
+    payload = claim["payload"]
+    assert payload["kind"] == "prepare" and payload["bundle"] == job["bundle"]
+    assert payload["store_url"].startswith("file://") and job["id"] in payload["store_url"]
+    assert home.job(job["id"])["state"] == "active"
+    worker.finish(claim, tiles=3, has_environment=True)
+
+    states = {(task["kind"], task["state"]) for task in home.tasks(job["id"])}
+    assert states == {("prepare", "completed"), ("render", "queued"), ("fit", "waiting"), ("package", "waiting")}
+    renders = [worker.must_claim() for _ in range(3)]
+    assert worker.claim() is None, "fits wait for the last tile"
+    assert [claim["payload"]["tile"]["column"] for claim in renders] == [0, 8, 16]
+    for claim in renders:
+        worker.finish(claim)
+
+    fits = [worker.must_claim(), worker.must_claim()]
+    assert [claim["payload"]["function"] for claim in fits] == ["light_field", "visibility"]
+    assert [len(claim["payload"]["renders"]) for claim in fits] == [3, 3]
+    for claim in fits:
+        worker.finish(claim)
+
+    claim = worker.must_claim()
+    assert claim["payload"]["job_id"] == job["id"] and len(claim["payload"]["fits"]) == 2
+    assert home.client.get(f"/v1/jobs/{job['id']}/artifacts").json() == []
+    worker.finish(claim)
+
+    done = home.job(job["id"])
+    assert done["state"] == "completed" and done["finished"] and done["remaining_s"] is None
+    assert done["notes"] == ["unwrapped"]
+    assert {s["kind"]: (s["total"], s["completed"], s["fraction"]) for s in done["stages"]} == {
+        "prepare": (1, 1, 1.0),
+        "render": (3, 3, 1.0),
+        "fit": (2, 2, 1.0),
+        "package": (1, 1, 1.0),
+    }
+    names = [artifact["name"] for artifact in home.client.get(f"/v1/jobs/{job['id']}/artifacts").json()]
+    assert names == ["lightfield.ktx2", "shaders/light.glsl"]
+    assert home.sql("SELECT count(*) AS left FROM procrastinate_jobs") == [{"left": 0}]
+
+
+def test_without_an_environment_there_is_no_visibility_to_fit(home):
+    job, worker = home.submit(), home.worker()
+    worker.advance(job["id"], "fit")
+    assert [task["label"] for task in home.tasks(job["id"], kind="fit")] == ["light_field"]
+
+
+def test_progress_and_estimate(home):
+    job, worker = home.submit(), home.worker()
+    assert home.job(job["id"])["remaining_s"] is None
+    claim = worker.must_claim()
+    worker.beat(claim, progress={"done": 1, "total": 4, "unit": "meshes"})
+    home.sql("UPDATE tasks SET started = now() - interval '10 s' WHERE state = 'active'")
+    view = home.job(job["id"])
+    assert view["stages"][0]["fraction"] == 0.25
+    assert 29 < view["remaining_s"] < 40, "10 s for a quarter leave 30 s"
+    task = home.tasks(job["id"])[0]
+    assert task["progress"]["unit"] == "meshes" and task["worker"] == "w"
+
+
+def test_kinds_are_respected_and_waiting_claims_are_woken(home):
+    worker = home.worker()
+    home.submit()
+    assert worker.claim("render", "fit") is None
+    assert worker.claim("prepare") is not None
+
+
+def test_a_waiting_claim_gets_the_task_that_comes(home):
+    import threading
+    import time
+
+    worker, got = home.worker(), []
+    thread = threading.Thread(target=lambda: got.append((worker.claim(wait_s=20), time.monotonic())))
+    thread.start()
+    time.sleep(0.3)
+    submitted = time.monotonic()
+    home.submit()
+    thread.join()
+    claim, at = got[0]
+    assert claim["payload"]["kind"] == "prepare" and at - submitted < 5
+
+
+def test_jobs_are_paged_and_filtered(home):
+    ids = [home.submit(name=f"job {i}")["id"] for i in range(5)]
+    home.client.post(f"/v1/jobs/{ids[2]}/cancel").raise_for_status()
+    seen, cursor = [], None
+    while True:
+        page = home.client.get("/v1/jobs", params={"limit": 2} | ({"cursor": cursor} if cursor else {})).json()
+        seen += [job["id"] for job in page["jobs"]]
+        cursor = page["next"]
+        if cursor is None:
+            break
+    assert seen == ids[::-1]
+    canceled = home.client.get("/v1/jobs", params={"state": "canceled"}).json()
+    assert [job["id"] for job in canceled["jobs"]] == [ids[2]]
+
+
+def test_later_stages_go_first(home):
+    older, worker = home.submit(), home.worker()
+    worker.advance(older["id"], "fit")
+    home.submit()
+    assert worker.must_claim()["payload"]["kind"] == "fit"
+
+
+def test_nothing_to_bake_fails_the_job_with_a_sentence(home):
+    for choices, word in (({"tiles": 0}, "no texel"), ({"has_light": False}, "no light")):
+        job, worker = home.submit(), home.worker()
+        worker.finish(worker.must_claim(), **choices)
+        failed = home.job(job["id"])
+        assert failed["state"] == "failed" and word in failed["error"]["detail"] and failed["error"]["remedy"]
+
+
+def test_tasks_keep_their_log(home):
+    home.submit()
+    worker = home.worker()
+    claim = worker.must_claim()
+    worker.beat(claim, log="reading\n")
+    worker.fail(claim, log="boom").raise_for_status()
+    again = worker.must_claim()
+    worker.beat(again, log="second try")
+    log = home.client.get(f"/v1/tasks/{claim['task_id']}/log").text
+    assert log == "--- attempt 1\nreading\nboom\n--- attempt 2\nsecond try\n"
