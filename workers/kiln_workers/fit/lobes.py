@@ -1,0 +1,53 @@
+"""From the network's unconstrained outputs to lobes: unit axes, bounded positive sharpness and amplitudes.
+
+Currius et al. 2020 leave the parametrisation open; it decides whether the fit works (docs/mathematics.md, "first
+experiments"): softplus amplitudes collapse to P = 0, exponentials do not. Each output is an offset, so that zero
+outputs are a sensible picture: axes start on a Fibonacci sphere, folded at the texel's tangent plane into its upper
+half (a reflection, so the start is continuous in the normal and no lobe is wasted below the horizon), with the
+sharpness at which N such lobes cover a hemisphere evenly.
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+import torch
+from kiln_schemas.conventions import LOBE_PARAMETERS
+from torch import Tensor
+
+LOG_SHARPNESS: Final = (math.log(0.25), math.log(3000.0))
+"""Range of log lambda: from nearly constant to one pixel of a 128 x 128 image; well inside fp16."""
+
+LOG_AMPLITUDE: Final = (-14.0, 11.0)
+"""Range of log mu in exposure-normalised radiance (the scene's mean is 0.18)."""
+
+START_AMPLITUDE: Final = 0.05
+
+
+def fibonacci_axes(count: int) -> Tensor:
+    """Unit axes [N, 3] spread evenly over the sphere (spherical Fibonacci lattice, Keinert et al. 2015)."""
+    index = np.arange(count, dtype=np.float64)
+    z = 1.0 - (2.0 * index + 1.0) / count
+    phi = index * np.pi * (3.0 - np.sqrt(5.0))
+    r = np.sqrt(1.0 - z * z)
+    return torch.from_numpy(np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1).astype(np.float32))
+
+
+def constrain(raw: Tensor, normals: Tensor) -> Tensor:
+    """Lobes [T, N, 7] in exposure-normalised radiance from outputs [T, N, 7] and unit normals [T, 3]."""
+    count = raw.shape[1]
+    start = fibonacci_axes(count).to(raw.device)
+    below = (normals @ start.T).clamp(max=0.0)  # [T, N]
+    folded = start - 2.0 * below[..., None] * normals[:, None, :]
+    axis = torch.nn.functional.normalize(folded + raw[..., :3], dim=-1, eps=1e-6)
+    sharpness = _bounded_exp(raw[..., 3:4], math.log(max(count, 2)), LOG_SHARPNESS)
+    amplitude = _bounded_exp(raw[..., 4:LOBE_PARAMETERS], math.log(START_AMPLITUDE), LOG_AMPLITUDE)
+    return torch.cat([axis, sharpness, amplitude], dim=-1)
+
+
+def _bounded_exp(raw: Tensor, start: float, bounds: tuple[float, float]) -> Tensor:
+    """exp(start + raw) near raw = 0, saturating smoothly towards exp(bounds), so that no output is ever stuck."""
+    low, high = bounds
+    middle, half = (low + high) / 2.0, (high - low) / 2.0
+    offset = math.atanh((start - middle) / half)
+    return torch.exp(middle + half * torch.tanh(offset + raw / half))

@@ -1,0 +1,55 @@
+"""Adam (Kingma and Ba 2015) on one flat vector, and the one-cycle schedule (Smith and Topin 2019).
+
+Written out because all of its state then is three arrays of a checkpoint, and because element-wise updates of one
+vector are the same bytes on any number of threads.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final, Self
+
+import torch
+from torch import Tensor
+
+BETA_1: Final = 0.9
+BETA_2: Final = 0.99
+EPSILON: Final = 1e-8
+WARM_UP: Final = 0.15
+"""Fraction of the steps in which the learning rate rises."""
+START: Final = 0.04
+"""Learning rate at the first step, relative to the peak."""
+END: Final = 1e-3
+
+
+@dataclass
+class Adam:
+    """Parameters and moments [P]."""
+
+    parameters: Tensor
+    mean: Tensor
+    square: Tensor
+
+    @classmethod
+    def start(cls, parameters: Tensor) -> Self:
+        return cls(parameters, torch.zeros_like(parameters), torch.zeros_like(parameters))
+
+    def to(self, device: torch.device) -> Self:
+        """The same on another device."""
+        return type(self)(self.parameters.to(device), self.mean.to(device), self.square.to(device))
+
+    def update(self, gradient: Tensor, rate: float, step: int) -> None:
+        """One update in place; `step` counts from 1."""
+        self.mean.lerp_(gradient, 1.0 - BETA_1)
+        self.square.mul_(BETA_2).addcmul_(gradient, gradient, value=1.0 - BETA_2)
+        denominator = (self.square / (1.0 - BETA_2**step)).sqrt_().add_(EPSILON)
+        self.parameters.addcdiv_(self.mean, denominator, value=-rate / (1.0 - BETA_1**step))
+
+
+def one_cycle(step: int, steps: int, peak: float) -> float:
+    """Learning rate of a step (from 0): a cosine from START * peak up to the peak and down to END * peak."""
+    warm = max(1.0, WARM_UP * steps)
+    if step < warm:
+        low, phase = START * peak, 1.0 - step / warm
+    else:
+        low, phase = END * peak, (step - warm) / max(1.0, steps - warm)
+    return low + (peak - low) * 0.5 * (1.0 + math.cos(math.pi * phase))

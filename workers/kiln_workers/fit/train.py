@@ -1,0 +1,262 @@
+"""Train one network on a source of texels: Adam, one cycle, log loss, checkpoints, the error at the end.
+
+A step's batch is cut into MICRO_BATCHES equal parts whatever the number of threads; each part's gradient is
+computed by one thread with single-threaded kernels, and the parts are added in order. So weights do not depend on the
+number of threads, and a fit resumed from a checkpoint ends in the bytes of an undisturbed one: random numbers
+come from (seed, step), the order of texels from `stream`, and a checkpoint holds the whole optimiser's state.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from kiln_schemas.conventions import LOBE_PARAMETERS
+from kiln_schemas.errors import FitFailed, InputError
+from kiln_schemas.settings import FitSettings, Function
+from kiln_schemas.tasks import CurvePoint, FitMetrics, Progress
+from torch import Tensor
+
+from kiln_workers.fit.lobes import constrain
+from kiln_workers.fit.loss import Sample, draw_sample, log_loss, sample_weights
+from kiln_workers.fit.metrics import TexelErrors, exposure_of, texel_errors
+from kiln_workers.fit.network import Shape, encode, initial_parameters, network_input, split
+from kiln_workers.fit.optimizer import Adam, one_cycle
+from kiln_workers.fit.predict import Weights, predict
+from kiln_workers.fit.source import Float16, Float32, TexelSource
+from kiln_workers.fit.stream import Batch, TexelStream
+from kiln_workers.fit.threads import single_threaded_pool
+from kiln_workers.scene.container import pack, unpack
+
+MICRO_BATCHES: Final = 4
+PIXEL_BLOCK: Final = 2
+"""A step evaluates one pixel of each PIXEL_BLOCK x PIXEL_BLOCK block."""
+
+CURVE_POINTS: Final = 200
+FAILURE_RATIO: Final = 0.5
+"""A fit whose error is above this fraction of the error of P = 0 has failed."""
+
+NO_SIGNAL: Final = 1e-10
+"""log_mse of P = 0 below which there is nothing to fit."""
+
+_CHECKPOINT: Final = "fit-checkpoint"
+_PIXEL_STREAM: Final = 0x706978
+"""Tells the random numbers of the pixels from the others of the same seed."""
+
+
+@dataclass(frozen=True)
+class FitOutcome:
+    weights: bytes
+    """For `predict`."""
+    exposure: float
+    metrics: FitMetrics
+    curve: tuple[CurvePoint, ...]
+    steps: int
+    seconds: float
+    """Of all attempts together, as far as their checkpoints tell."""
+
+
+@dataclass
+class _State:
+    """All that changes from step to step."""
+
+    step: int
+    adam: Adam
+    exposure: float
+    seconds: float = 0.0
+    curve: list[CurvePoint] = field(default_factory=list)
+    pending: list[float] = field(default_factory=list)
+    """Losses since the curve's last point."""
+
+
+def train(
+    source: TexelSource,
+    settings: FitSettings,
+    function: Function,
+    seed: int,
+    *,
+    threads: int = 1,
+    device: str = "cpu",
+    checkpoint: bytes | None = None,
+    on_checkpoint: Callable[[bytes], None] = lambda _: None,
+    on_progress: Callable[[Progress], None] = lambda _: None,
+    checkpoint_every_s: float = 60.0,
+) -> FitOutcome:
+    """Fit one function; FitFailed where it does not clearly beat P = 0, InputError where there are no texels."""
+    began = time.monotonic()
+    if not sum(source.counts):
+        raise InputError(
+            f"no texel of the light map is valid, so there is nothing to fit the {function.value} to",
+            where="texel map",
+            remedy="Check the scene: every texel lies inside other geometry.",
+        )
+    shape = Shape(source.image_size, settings.lobes)
+    identity = {
+        "function": function.value,
+        "seed": seed,
+        "settings": settings.model_dump(mode="json"),
+        "image_size": shape.image_size,
+        "counts": list(source.counts),
+    }
+    if checkpoint is not None:
+        state = _restore(checkpoint, identity)
+    else:
+        state = _State(0, Adam.start(initial_parameters(shape, seed)), exposure_of(source, function))
+    began -= state.seconds
+    with single_threaded_pool(threads) as pool:
+        if checkpoint is None and _errors(source, None, state.exposure, pool).log_mse_zero < NO_SIGNAL:
+            return _without_signal(source, shape, state, time.monotonic() - began)
+        trainer = _Trainer(shape, settings, seed, device, pool, state)
+        last_saved = time.monotonic()
+        stream = TexelStream(source, seed, settings.batch, settings.window)
+        for batch in islice(stream.batches(state.step), settings.steps - state.step):
+            trainer.step(batch)
+            on_progress(_progress(state, settings))
+            if time.monotonic() - last_saved >= checkpoint_every_s and state.step < settings.steps:
+                on_checkpoint(_save(state, identity, time.monotonic() - began))
+                last_saved = time.monotonic()
+        weights = Weights(shape, state.exposure, True, state.adam.parameters.cpu().numpy())
+        errors = _errors(source, weights, state.exposure, pool)
+    _refuse_failure(errors, function, settings)
+    return FitOutcome(
+        weights=weights.to_bytes(),
+        exposure=state.exposure,
+        metrics=_metrics(errors, signal=True),
+        curve=tuple(state.curve),
+        steps=state.step,
+        seconds=time.monotonic() - began,
+    )
+
+
+class _Trainer:
+    """Takes steps: forward, backward and update of the state."""
+
+    def __init__(
+        self, shape: Shape, settings: FitSettings, seed: int, device: str, pool: ThreadPoolExecutor, state: _State
+    ) -> None:
+        self._shape, self._settings, self._seed, self._state = shape, settings, seed, state
+        self._device, self._pool = torch.device(device), pool
+        state.adam = state.adam.to(self._device)
+
+    def step(self, batch: Batch) -> None:
+        """One optimiser step; the loss joins the curve."""
+        state, settings = self._state, self._settings
+        rng = np.random.default_rng([self._seed, _PIXEL_STREAM, state.step])
+        sample = draw_sample(self._shape.image_size, PIXEL_BLOCK, rng).to(self._device)
+        parts = np.array_split(np.arange(len(batch.images)), MICRO_BATCHES)
+
+        def gradient(part: npt.NDArray[np.int64]) -> tuple[float, Tensor]:
+            return self._gradient(batch.images[part], batch.normals[part], sample, len(batch.images))
+
+        results = self._map(gradient, [part for part in parts if len(part)])
+        total = results[0][1]
+        for _, part in results[1:]:
+            total += part
+        rate = one_cycle(state.step, settings.steps, settings.learning_rate)
+        state.step += 1
+        state.adam.update(total, rate, state.step)
+        _extend_curve(state, sum(loss for loss, _ in results), settings.steps)
+
+    def _map(
+        self, work: Callable[[npt.NDArray[np.int64]], tuple[float, Tensor]], parts: list[npt.NDArray[np.int64]]
+    ) -> list[tuple[float, Tensor]]:
+        # One stream of kernels keeps a GPU busy; its results are added in the same order.
+        return [work(part) for part in parts] if self._device.type == "cuda" else list(self._pool.map(work, parts))
+
+    def _gradient(self, images: Float16, normals: Float32, sample: Sample, batch: int) -> tuple[float, Tensor]:
+        """Loss and flat gradient [P] of a micro-batch, as its share of a batch of `batch` texels."""
+        pixels = torch.from_numpy(images).to(self._device)
+        normal = torch.from_numpy(normals).to(self._device)
+        layers = [layer.detach().requires_grad_() for layer in split(self._shape, self._state.adam.parameters)]
+        inputs = network_input(pixels, normal, self._state.exposure)
+        log_targets = inputs[:, :3].permute(0, 2, 3, 1).flatten(1, 2)[:, sample.pixels]
+        weights = sample_weights(sample, normal) / (2.0 * np.pi * 3.0 * batch)
+        lobes = constrain(encode(layers, inputs), normal)
+        loss = log_loss(lobes, log_targets, sample.directions, weights)
+        gradients = torch.autograd.grad(loss, layers)
+        return float(loss.detach()), torch.cat([gradient.reshape(-1) for gradient in gradients])
+
+
+def _errors(source: TexelSource, weights: Weights | None, exposure: float, pool: ThreadPoolExecutor) -> TexelErrors:
+    """Errors of all texels, tile by tile in order; without weights those of P = 0.
+
+    Measured on lobes rounded to fp16, because that is what the textures hold.
+    """
+
+    def of_tile(tile: int) -> TexelErrors:
+        images = source.images(tile, np.arange(source.counts[tile], dtype=np.int64))
+        normals = source.normals(tile)
+        if weights is None:
+            lobes = np.zeros((len(images), 1, LOBE_PARAMETERS), np.float32)
+        else:
+            lobes = predict(weights, images, normals).astype(np.float16).astype(np.float32)
+        return texel_errors(lobes, images, normals, exposure)
+
+    return TexelErrors.join(pool.map(of_tile, range(len(source.counts))))
+
+
+def _metrics(errors: TexelErrors, *, signal: bool) -> FitMetrics:
+    return FitMetrics(
+        log_mse=errors.log_mse,
+        log_mse_zero=errors.log_mse_zero,
+        log_mse_rel=errors.log_mse_rel,
+        texels=len(errors.error),
+        signal=signal,
+    )
+
+
+def _refuse_failure(errors: TexelErrors, function: Function, settings: FitSettings) -> None:
+    if not errors.log_mse_rel <= FAILURE_RATIO:  # also true for NaN
+        raise FitFailed(
+            f"the fit of the {function.value} ended at log_mse {errors.log_mse:.4g}, {errors.log_mse_rel:.0%} of the "
+            f"{errors.log_mse_zero:.4g} that no light at all would have (at most {FAILURE_RATIO:.0%} is accepted)",
+            where=f"fit {function.value}",
+            remedy=f"Raise fit.steps (now {settings.steps}) or fit.lobes (now {settings.lobes}).",
+        )
+
+
+def _without_signal(source: TexelSource, shape: Shape, state: _State, seconds: float) -> FitOutcome:
+    """The outcome where the function is zero everywhere: lobes of zero amplitude, nothing trained."""
+    weights = Weights(shape, state.exposure, False, state.adam.parameters.numpy())
+    metrics = FitMetrics(log_mse=0.0, log_mse_zero=0.0, log_mse_rel=0.0, texels=sum(source.counts), signal=False)
+    return FitOutcome(weights.to_bytes(), state.exposure, metrics, (), 0, seconds)
+
+
+def _extend_curve(state: _State, loss: float, steps: int) -> None:
+    state.pending.append(loss)
+    if state.step % max(1, steps // CURVE_POINTS) == 0 or state.step == steps:
+        state.curve.append(CurvePoint(step=state.step, loss=sum(state.pending) / len(state.pending)))
+        state.pending.clear()
+
+
+def _progress(state: _State, settings: FitSettings) -> Progress:
+    loss = state.curve[-1].loss if state.curve else state.pending[-1]
+    return Progress(done=state.step, total=settings.steps, unit="steps", loss=loss)
+
+
+def _save(state: _State, identity: Mapping[str, Any], seconds: float) -> bytes:
+    adam = state.adam
+    body = {
+        "identity": identity,
+        "step": state.step,
+        "exposure": state.exposure,
+        "seconds": seconds,
+        "curve": [[point.step, point.loss] for point in state.curve],
+        "pending": state.pending,
+    }
+    arrays = {"parameters": adam.parameters, "mean": adam.mean, "square": adam.square}
+    return pack(_CHECKPOINT, body, {name: value.cpu().numpy() for name, value in arrays.items()})
+
+
+def _restore(checkpoint: bytes, identity: Mapping[str, Any]) -> _State:
+    body, arrays = unpack(_CHECKPOINT, checkpoint)
+    if body["identity"] != identity:
+        raise InputError("the checkpoint belongs to another fit", where="checkpoint", remedy="Start without it.")
+    adam = Adam(*(torch.from_numpy(arrays[name].copy()) for name in ("parameters", "mean", "square")))
+    curve = [CurvePoint(step=step, loss=loss) for step, loss in body["curve"]]
+    return _State(body["step"], adam, body["exposure"], body["seconds"], curve, body["pending"])
