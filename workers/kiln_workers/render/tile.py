@@ -21,6 +21,7 @@ from kiln_schemas.settings import RenderSettings
 from kiln_workers.render import counters
 from kiln_workers.render.backend import Device, select_variant
 from kiln_workers.render.paths import TEXEL_OFFSET, LaneSums, PathTracer, Start
+from kiln_workers.render.visibility import RayTable, texel_hash, trace_visibility, weighted_visibility
 from kiln_workers.scene.model import Float32, Scene
 from kiln_workers.sphere import octahedral
 
@@ -75,17 +76,19 @@ class TileRenderer:
         self.key = int(scene_hash[:16], 16)
         self.tracer = PathTracer(scene, settings.max_depth)
         self.wavefront = wavefront_lanes(memory_bytes)
+        self.table = None if scene.environment is None else RayTable.make(scene.environment, settings.image_size)
         self.pixel_area = 4.0 / settings.image_size**2
         self.solid_angles = mi.Float(octahedral.pixel_solid_angles(settings.image_size).astype(np.float32).ravel())
 
     def render(self, texels: TexelBatch, on_progress: Callable[[float], None] | None = None) -> TileImages:
         """All images of the batch; `on_progress` is called with the fraction done and may raise to stop."""
         report = on_progress or (lambda fraction: None)
-        light_field, back_faces, paths, overflows = self._light_fields(texels, lambda f: report(0.7 * f))
-        irradiance, irradiance_paths, dropped = self._irradiance(texels, lambda f: report(0.7 + 0.3 * f))
+        light_field, back_faces, paths, overflows = self._light_fields(texels, lambda f: report(0.6 * f))
+        irradiance, irradiance_paths, dropped = self._irradiance(texels, lambda f: report(0.6 + 0.2 * f))
+        visibility = self._visibility(texels, lambda f: report(0.8 + 0.2 * f))
         return TileImages(
             light_field=light_field,
-            visibility=None,
+            visibility=visibility,
             irradiance=irradiance,
             back_faces=back_faces,
             paths=paths + irradiance_paths,
@@ -172,6 +175,28 @@ class TileRenderer:
         direct = self.tracer.direct(direct_lanes, count, points.origin, points.normal, points.shading_normal)
         dr.eval(paths.radiance, paths.dropped, direct)
         return paths, direct
+
+    def _visibility(self, texels: TexelBatch, report: Callable[[float], None]) -> Float16 | None:
+        if self.table is None:
+            return None
+        size = self.settings.image_size
+        out = np.zeros((len(texels), size * size, 3), np.float16)
+        # The convolution needs a texel's whole hemisphere, so wavefronts are cut between texels here.
+        group = max(1, self.wavefront // (size * size))
+        for first in range(0, len(texels), group):
+            numbers = slice(first, first + group)
+            lanes = lanes_above_horizon(texels.normal[numbers], size)
+            points = _Points(texels, lanes[:, 0] + first, self.tracer.rounding)
+            pixels = mi.UInt32(lanes[:, 1].astype(np.uint32))
+            hashes = texel_hash(self.key, points.index)
+            seen, above = trace_visibility(self.tracer, self.table, hashes, pixels, points.origin, points.normal)
+            dr.eval(seen, above)
+            values = weighted_visibility(
+                self.table, size, texels.alpha[numbers], lanes, np.array(seen), np.array(above)
+            )
+            out[lanes[:, 0] + first, lanes[:, 1]] = values.astype(np.float16)
+            report(min(first + group, len(texels)) / len(texels))
+        return out.reshape(len(texels), size, size, 3)
 
     def _wavefronts(self, lanes: Int64) -> Iterator[tuple[Int64, float]]:
         for first in range(0, len(lanes), self.wavefront):
