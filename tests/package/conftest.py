@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from kiln_schemas.settings import Function, make_settings
 from kiln_schemas.tasks import (
@@ -22,7 +23,6 @@ from kiln_schemas.tasks import (
     RenderResult,
     Tile,
 )
-
 from kiln_workers.package.build import EnvironmentTextures, LobeMap, PackageInput
 from kiln_workers.package.half import as_stored
 from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelPreview, choose_texels
@@ -63,6 +63,26 @@ def node_tools(tmp_path_factory: pytest.TempPathFactory) -> NodeTools:
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=180)
     assert done.returncode == 0, f"npm could not install the readers that package.json pins:\n{done.stderr}"
     return NodeTools(folder)
+
+
+@pytest.fixture
+def read_png(tmp_path: Path) -> Callable[[bytes], np.ndarray]:
+    """Decode PNG bytes with OpenImageIO, colours not multiplied by alpha: uint8 [H, W, channels]."""
+
+    def read(data: bytes) -> np.ndarray:
+        path = tmp_path / f"{len(list(tmp_path.iterdir()))}.png"
+        path.write_bytes(data)
+        config = oiio.ImageSpec()
+        config.attribute("oiio:UnassociatedAlpha", 1)
+        source = oiio.ImageInput.open(str(path), config)
+        assert source is not None, oiio.geterror()
+        try:
+            spec = source.spec()
+            return source.read_image(oiio.UINT8).reshape(spec.height, spec.width, spec.nchannels)
+        finally:
+            source.close()
+
+    return read
 
 
 @dataclass(frozen=True)

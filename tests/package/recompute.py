@@ -1,4 +1,4 @@
-"""Recomputes a package's errors from its KTX2 file and the light-field store by code that shares nothing with lightkiln.
+"""Recomputes a package's errors from its KTX2 file and the light-field store, sharing no code with lightkiln.
 
 Only numpy and zarr-python: an own KTX2 parser, an own octahedral map, solid angles by summing the area element over
 sub-pixels. Run it as a program (`python recompute.py PACKAGE STORE light_field`) or call `recompute`.
@@ -71,4 +71,8 @@ def unfold(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    print("log_mse {:.6g}  log_mse_zero {:.6g}  log_mse_rel {:.6g}".format(*recompute(*map(Path, sys.argv[1:3]), sys.argv[3])))
+    print(
+        "log_mse {:.6g}  log_mse_zero {:.6g}  log_mse_rel {:.6g}".format(
+            *recompute(*map(Path, sys.argv[1:3]), sys.argv[3])
+        )
+    )

@@ -17,7 +17,7 @@ UInt8 = npt.NDArray[np.uint8]
 
 CURVE_POINTS: Final = 240
 _WIDTH, _HEIGHT = 640, 260
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 12, 34
+_LEFT, _RIGHT, _TOP, _BOTTOM = 66, 30, 12, 34
 
 
 def data_uri(pixels: UInt8) -> str:
@@ -63,7 +63,7 @@ def loss_curve(points: Sequence[CurvePoint]) -> Markup:
             if low - 1e-9 <= tick <= high + 1e-9:
                 at = y(10.0**tick)
                 parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>')
-                parts.append(f'<text x="{_LEFT - 8}" y="{at + 4:.1f}" text-anchor="end">{short(10.0**tick)}</text>')
+                parts.append(f'<text x="{_LEFT - 8}" y="{at + 4:.1f}" text-anchor="end">{10.0**tick:g}</text>')
     for tick in _round_ticks(last):
         parts.append(f'<text x="{x(tick):.1f}" y="{_HEIGHT - 12}" text-anchor="middle">{tick:,.0f}</text>')
     line = " ".join(f"{x(step):.1f},{y(loss):.1f}" for step, loss in zip(steps, losses, strict=True))

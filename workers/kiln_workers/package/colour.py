@@ -48,11 +48,12 @@ def white_point(rgb: Floats, quantile: float = 0.99) -> float:
 def tone_map(rgb: Floats, white: float) -> UInt8:
     """8-bit sRGB of linear colours [..., 3]; `white` maps to 1 (Reinhard et al. 2002, eq. 4, on luminance).
 
-    The key is a quarter of `white`, so that a picture with a few bright texels keeps its middle tones visible.
+    Luminance is scaled so that `white` is 2 in Reinhard's units: bright texels are compressed gently and the middle
+    tones of a picture with a few very bright texels stay visible.
     """
-    scaled = np.maximum(rgb, 0.0) * (4.0 / white)
+    scaled = np.maximum(rgb, 0.0) * (2.0 / white)
     light = luminance(scaled)[..., None]
-    return quantise(srgb_encode(scaled * (1.0 + light / 16.0) / (1.0 + light)))
+    return quantise(srgb_encode(scaled * (1.0 + light / 4.0) / (1.0 + light)))
 
 
 def viridis(values: Floats) -> UInt8:

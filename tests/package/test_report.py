@@ -1,0 +1,146 @@
+"""The report: self-contained, safe against hostile names, and showing what it says it shows."""
+
+import base64
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kiln_schemas.settings import Function
+from kiln_schemas.tasks import CurvePoint
+from kiln_workers.package import charts, report
+from kiln_workers.package.build import build_package
+from kiln_workers.package.preview import choose_texels
+
+
+class Page(HTMLParser):
+    """Elements and attributes of a page, and whether its tags close in order."""
+
+    VOID = frozenset({"meta", "img", "br", "line", "circle", "polyline", "link", "input"})
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def built(tmp_path: Path, sample) -> tuple[str, Page]:
+    build_package(tmp_path, sample.given)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    return text, Page(text)
+
+
+def test_it_refers_to_nothing_outside_itself(make_sample, tmp_path: Path) -> None:
+    text, page = built(tmp_path, make_sample())
+    assert not {tag for tag, _ in page.elements} & {"script", "link", "iframe", "object", "embed", "base", "form"}
+    sources = [attributes["src"] for tag, attributes in page.elements if tag == "img"]
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert not re.search(r"https?://|url\(|@import", text)
+    assert "default-src 'none'" in text
+
+
+def test_hostile_names_are_text(make_sample, tmp_path: Path) -> None:
+    name = "<script>alert(1)</script>\"'><img src=x onerror=alert(2)>{{ 7 * 7 }}"
+    text, page = built(tmp_path, make_sample(name=name))
+    assert not [tag for tag, _ in page.elements if tag == "script"]
+    assert not [1 for _, attributes in page.elements if any(key.startswith("on") for key in attributes)]
+    assert "<script" not in text
+    assert name in "".join(page.text)
+
+
+def test_it_shows_pictures_of_three_texels_per_function_and_all_figures(make_sample, tmp_path: Path, read_png) -> None:
+    sample = make_sample()
+    _, page = built(tmp_path, sample)
+    by_label = {attributes["alt"]: attributes["src"] for tag, attributes in page.elements if tag == "img"}
+    for label in ("best", "median", "worst"):
+        for kind in ("traced", "stored"):
+            assert f"{label} texel as {kind}" in by_label
+    words = "".join(page.text)
+    for function in Function:
+        assert charts.short(sample.given.metrics[function].log_mse_rel) in words
+    picture = read_png(base64.b64decode(by_label["validity, density and charts of the light map"].partition(",")[2]))
+    np.testing.assert_array_equal(picture, sample.given.preview.atlas)
+    for item in ("lightfield.ktx2", "scene.glb", "shaders/sg.glsl"):
+        assert item in words
+
+
+def test_without_environment_it_says_why_there_is_no_visibility(make_sample, tmp_path: Path) -> None:
+    _, page = built(tmp_path, make_sample(environment=False))
+    words = "".join(page.text)
+    assert "visibility: the scene has no environment" in " ".join(words.split())
+    assert "Environment visibility" not in words
+
+
+def test_pictures_show_only_what_lies_above_the_horizon(make_sample) -> None:
+    texel = make_sample().given.preview.functions[Function.LIGHT_FIELD].best
+    original, predicted, difference = report.light_field_pictures(texel, Function.LIGHT_FIELD, 0.7)
+    above = original[..., 3] == 255
+    assert 0.4 < above.mean() < 0.6
+    assert (original[..., 3] == predicted[..., 3]).all()
+    assert (original[..., 3] == difference[..., 3]).all()
+    # Where the metric sees no difference the map shows viridis' dark end.
+    same = report.light_field_pictures(
+        type(texel)(0, 0, 0.0, texel.normal, texel.original, texel.original), Function.LIGHT_FIELD, 0.7
+    )
+    assert (same[2][..., :3] == (0x44, 0x01, 0x54)).all()
+    np.testing.assert_array_equal(same[0], same[1])
+
+
+def test_best_median_and_worst_are_chosen_by_error() -> None:
+    errors = np.full((3, 4), np.nan, np.float32)
+    errors[0, 1], errors[1, 2], errors[2, 3] = 0.3, 0.1, 0.2
+    assert choose_texels(errors) == ((1, 2), (2, 3), (0, 1))
+
+
+def test_the_heat_map_is_clear_where_there_are_no_lobes() -> None:
+    errors = np.geomspace(1e-4, 1e-1, 400).reshape(20, 20).astype(np.float32)
+    errors[0, :3] = np.nan
+    picture, low, high = charts.heat_map(errors)
+    assert (picture[0, :3, 3] == 0).all()
+    assert (picture[1:, :, 3] == 255).all()
+    assert 1e-4 < low < 2e-4 < 5e-2 < high < 1e-1
+    assert picture[-1, -1, :3].tolist() == [0xFD, 0xE7, 0x25]
+
+
+@pytest.mark.parametrize(
+    "losses", [[0.5], [0.1, 0.1, 0.1], [1.0, 1e-6], [0.0, 0.0], list(np.geomspace(1.0, 1e-3, 5000))]
+)
+def test_loss_curves_of_any_length_stay_inside_the_drawing(losses: list[float]) -> None:
+    points = [CurvePoint(step=step, loss=loss) for step, loss in enumerate(losses)]
+    drawing = str(charts.loss_curve(points))
+    (line,) = re.findall(r'points="([^"]*)"', drawing)
+    coordinates = np.array([[float(c) for c in pair.split(",")] for pair in line.split()])
+    assert np.isfinite(coordinates).all()
+    assert len(coordinates) <= charts.CURVE_POINTS
+    assert (coordinates >= 0).all()
+    assert (coordinates <= (640, 260)).all()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.0, "0"), (0.012345, "0.0123"), (1234.5, "1,234"), (2.5e-6, "2.50·10⁻⁶"), (0.5, "0.500")]
+)
+def test_numbers_are_short(value: float, text: str) -> None:
+    assert charts.short(value) == text
+
+
+@pytest.mark.parametrize(("value", "word"), [(0.01, "excellent"), (0.149, "good"), (0.3, "poor"), (0.7, "failed")])
+def test_the_verdict_follows_the_relative_error(value: float, word: str) -> None:
+    assert report.grade(value)[0] == word
