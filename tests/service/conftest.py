@@ -8,26 +8,34 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import httpx
 import psycopg
 import pytest
 import uvicorn
-from psycopg.rows import dict_row
-
 from kiln_service.app import create_app
 from kiln_service.config import Limits, ServiceConfig, Timing
 from kiln_service.embedded import EmbeddedPostgres
+from psycopg.rows import dict_row
 
 FAST = Timing(heartbeat_s=0.2, stale_s=0.8, poll_s=0.1, maintenance_s=0.1)
 SLOW_REAPER = Timing(heartbeat_s=0.2, stale_s=600, poll_s=0.1, maintenance_s=0.1)
 
 
 @pytest.fixture(scope="session")
-def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedPostgres]:
-    with EmbeddedPostgres(tmp_path_factory.mktemp("database") / "postgres") as server:
+def postgres() -> Iterator[EmbeddedPostgres]:
+    # Not under pytest's folder: every pytest that starts makes that one private again, and the server is another user.
+    with TemporaryDirectory(prefix="kiln-test-") as folder, EmbeddedPostgres(Path(folder) / "postgres") as server:
         yield server
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A data folder for a coordinator with an embedded database."""
+    with TemporaryDirectory(prefix="kiln-test-") as folder:
+        yield Path(folder)
 
 
 @pytest.fixture

@@ -1,0 +1,79 @@
+"""Tokens and scopes."""
+
+import hashlib
+import re
+import stat
+
+import httpx
+import pytest
+from kiln_service.auth import own_token
+from kiln_service.config import Scope, TokenEntry
+
+OPEN = {"/healthz", "/readyz"}
+PLACEHOLDERS = {"sha256": "0" * 64}
+
+
+def routes(home):
+    """Every method and path of the interface, with something in place of its parameters."""
+    document = home.client.get("/v1/openapi.json").json()
+    for path, operations in document["paths"].items():
+        filled = re.sub(r"{(\w+)}", lambda match: PLACEHOLDERS.get(match[1], "x"), path)
+        yield from ((method.upper(), filled) for method in operations)
+
+
+@pytest.mark.parametrize("header", [None, "Bearer wrong", "Basic dXNlcjpwdw==", "Bearer", "Bearer \xff\xfe"])
+def test_every_route_refuses_without_a_valid_token(home, header):
+    headers = {} if header is None else {"Authorization": header.encode("latin-1")}
+    found = list(routes(home))
+    assert len(found) > 15
+    with httpx.Client(base_url=home.url, headers=headers) as stranger:
+        for method, path in found:
+            reply = stranger.request(method, path)
+            if path in OPEN:
+                assert reply.status_code == 200, path
+                continue
+            assert reply.status_code == 401, (method, path)
+            assert reply.headers["www-authenticate"] == "Bearer"
+            if method != "HEAD":
+                assert reply.headers["content-type"] == "application/problem+json"
+                assert reply.json()["code"] == "unauthorized" and reply.json()["remedy"]
+
+
+def test_a_token_that_differs_in_its_last_letter_is_refused(home):
+    for token in (home.token[:-1], home.token + "x", home.token[:-1] + ("a" if home.token[-1] != "a" else "b")):
+        reply = httpx.get(f"{home.url}/v1/jobs", headers={"Authorization": f"Bearer {token}"})
+        assert reply.status_code == 401
+
+
+def test_the_body_of_a_stranger_is_not_read(home):
+    reply = httpx.put(f"{home.url}/v1/blobs/{'0' * 64}", content=b"x" * 1000)
+    assert reply.status_code == 401 and home.sql("SELECT * FROM blobs") == []
+
+
+def test_scopes_bound_what_a_token_may_do(start):
+    tokens = tuple(
+        TokenEntry(name=scope, sha256=hashlib.sha256(scope.encode()).hexdigest(), scopes=(scope,)) for scope in Scope
+    )
+    allowed = {
+        ("GET", "/v1/jobs"): {Scope.READ},
+        ("POST", "/v1/jobs"): {Scope.SUBMIT},
+        ("POST", "/v1/jobs/x/cancel"): {Scope.SUBMIT},
+        ("POST", "/v1/blobs/missing"): {Scope.SUBMIT, Scope.WORKER},
+        ("GET", f"/v1/blobs/{'0' * 64}"): {Scope.READ, Scope.WORKER},
+        ("POST", "/v1/workers"): {Scope.WORKER},
+        ("POST", "/v1/tasks/x/commit"): {Scope.WORKER},
+    }
+    with start(tokens=tokens) as home:
+        for (method, path), scopes in allowed.items():
+            for scope in Scope:
+                headers = {"Authorization": f"Bearer {scope}"}
+                refused = httpx.request(method, home.url + path, headers=headers).status_code == 403
+                assert refused == (scope not in scopes | {Scope.ADMIN}), (method, path, scope)
+
+
+def test_the_token_file_is_the_owners_alone_and_stays(tmp_path):
+    first = own_token(tmp_path)
+    assert stat.S_IMODE((tmp_path / "token").stat().st_mode) == 0o600
+    assert own_token(tmp_path) == first
+    assert [file.name for file in tmp_path.iterdir()] == ["token"]
+    assert len((tmp_path / "token").read_text().strip()) >= 43

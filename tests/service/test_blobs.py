@@ -1,0 +1,159 @@
+"""Uploads arrive whole or not at all."""
+
+import hashlib
+import resource
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+from kiln_service.config import Limits, Timing
+
+DATA = bytes(range(256)) * 8192  # 2 MiB
+SHA256 = hashlib.sha256(DATA).hexdigest()
+
+
+def left_behind(home):
+    """Files in the upload folder, objects, rows."""
+    blobs = Path(home.config.data) / "blobs"
+    objects = [file for file in blobs.rglob("*") if file.is_file()]
+    return [*home.config.incoming.iterdir(), *objects, *home.sql("SELECT * FROM blobs")]
+
+
+def test_round_trip(home):
+    assert home.client.post("/v1/blobs/missing", json={"sha256": [SHA256]}).json() == {"missing": [SHA256]}
+    assert home.client.put(f"/v1/blobs/{SHA256}", content=DATA).status_code == 201
+    assert home.client.put(f"/v1/blobs/{SHA256}", content=DATA).status_code == 201, "twice is no error"
+    other = "0" * 64
+    reply = home.client.post("/v1/blobs/missing", json={"sha256": [other, SHA256, other]})
+    assert reply.json() == {"missing": [other]}
+    assert home.client.get(f"/v1/blobs/{SHA256}").content == DATA
+    head = home.client.head(f"/v1/blobs/{SHA256}")
+    assert head.headers["content-length"] == str(len(DATA)) and head.headers["etag"] == f'"{SHA256}"'
+    assert home.client.head(f"/v1/blobs/{other}").status_code == 404
+    assert list(home.config.incoming.iterdir()) == []
+
+
+def test_an_empty_blob(home):
+    sha256 = home.upload(b"")
+    assert home.client.get(f"/v1/blobs/{sha256}").content == b""
+
+
+def test_a_body_without_a_length(home):
+    reply = home.client.put(f"/v1/blobs/{SHA256}", content=iter([DATA[:1000], DATA[1000:]]))
+    assert reply.status_code == 201
+    assert home.client.get(f"/v1/blobs/{SHA256}").content == DATA
+
+
+def test_a_wrong_hash_leaves_nothing(home):
+    reply = home.client.put(f"/v1/blobs/{SHA256}", content=DATA[:-1] + b"x")
+    assert reply.status_code == 422 and reply.json()["where"] == SHA256 and "sha256" in reply.json()["detail"]
+    assert left_behind(home) == []
+
+
+def test_a_name_that_is_no_hash(home):
+    for name in ("abc", "G" * 64, "0" * 63, "%2e%2e%2fetc"):
+        assert home.client.put(f"/v1/blobs/{name}", content=b"").status_code in (404, 422)
+    assert left_behind(home) == []
+
+
+@pytest.mark.parametrize("half_close", [True, False])
+def test_a_truncated_upload_leaves_nothing(home, eventually, half_close):
+    address = httpx.URL(home.url)
+    with socket.create_connection((address.host, address.port)) as connection:
+        connection.sendall(
+            f"PUT /v1/blobs/{SHA256} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {home.token}\r\n"
+            f"Content-Length: {len(DATA)}\r\n\r\n".encode()
+        )
+        connection.sendall(DATA[: len(DATA) * 3 // 4])
+        eventually(lambda: list(home.config.incoming.iterdir()))
+        if half_close:
+            connection.shutdown(socket.SHUT_WR)
+            answer = connection.recv(4096)
+            assert answer == b"" or b" 400 " in answer.split(b"\r\n")[0]
+    eventually(lambda: left_behind(home) == [])
+    assert home.client.post("/v1/blobs/missing", json={"sha256": [SHA256]}).json() == {"missing": [SHA256]}
+
+
+def test_a_body_shorter_than_announced_is_400(home):
+    """As a server sees it that does not check the length itself."""
+    import asyncio
+
+    async def call():
+        sent = []
+        messages = iter([{"type": "http.request", "body": DATA[:10], "more_body": False}])
+
+        async def receive():
+            return next(messages)
+
+        async def send(message):
+            sent.append(message)
+
+        headers = [(b"authorization", f"Bearer {home.token}".encode()), (b"content-length", b"11")]
+        scope = {"type": "http", "method": "PUT", "path": f"/v1/blobs/{SHA256}", "headers": headers}
+        await home.app(scope | {"query_string": b"", "http_version": "1.1", "root_path": ""}, receive, send)
+        return sent
+
+    portal = home.app.state.loop if hasattr(home.app.state, "loop") else None
+    sent = asyncio.run_coroutine_threadsafe(call(), portal).result(10) if portal else asyncio.run(call())
+    assert sent[0]["status"] == 400 and b"truncated" in sent[1]["body"]
+    assert left_behind(home) == []
+
+
+def test_too_large(start):
+    with start(limits=Limits(reserve_bytes=0, blob_bytes=1000)) as home:
+        assert home.client.put(f"/v1/blobs/{SHA256}", content=DATA).status_code == 413
+        assert home.client.put(f"/v1/blobs/{SHA256}", content=iter([DATA])).status_code == 413
+        assert left_behind(home) == []
+
+
+def test_no_space_left_by_the_reserve(start):
+    with start(limits=Limits(reserve_bytes=2**60)) as home:
+        reply = home.client.put(f"/v1/blobs/{SHA256}", content=DATA)
+        assert reply.status_code == 507 and reply.json()["code"] == "machine-lacks" and reply.json()["remedy"]
+        assert left_behind(home) == []
+
+
+def test_a_full_disk(start, eventually):
+    """A real coordinator whose files may not grow over 1 MiB: writing fails in the middle, as on a full disk."""
+    config = start.config()
+    start.data.mkdir()
+    file = start.data / "config.json"
+    file.write_text(config.model_dump_json())
+    process = subprocess.Popen(
+        [sys.executable, "-m", "kiln_service", "--config", str(file), "--port", "0", "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, 2**20)),
+        text=True,
+    )
+    with process:
+        try:
+            import json
+
+            url = json.loads(process.stdout.readline())["url"]
+            headers = {"Authorization": f"Bearer {(start.data / 'token').read_text().strip()}"}
+            with httpx.Client(base_url=url, headers=headers) as client:
+                reply = client.put(f"/v1/blobs/{SHA256}", content=DATA)
+                assert reply.status_code == 507 and "full" in reply.json()["detail"]
+                assert list(config.incoming.iterdir()) == []
+                small = hashlib.sha256(b"small").hexdigest()
+                assert client.put(f"/v1/blobs/{small}", content=b"small").status_code == 201
+        finally:
+            process.terminate()
+
+
+def test_blobs_that_nothing_uses_are_collected(start, eventually):
+    timing = Timing(poll_s=0.1, maintenance_s=0.1, stale_s=600, blob_grace_s=0.5)
+    with start(timing=timing) as home:
+        job = home.submit()
+        used = job["bundle"]["files"]["scene.glb"]
+        unused = home.upload(b"nobody wants me")
+        eventually(lambda: home.client.get(f"/v1/blobs/{unused}").status_code == 404)
+        time.sleep(0.5)
+        assert home.client.get(f"/v1/blobs/{used}").status_code == 200
+        assert home.upload(b"nobody wants me") == unused
+        assert home.client.get(f"/v1/blobs/{unused}").content == b"nobody wants me"
