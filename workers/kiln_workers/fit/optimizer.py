@@ -5,6 +5,7 @@ vector are the same bytes on any number of threads.
 """
 
 import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -19,6 +20,11 @@ WARM_UP: Final = 0.15
 START: Final = 0.04
 """Learning rate at the first step, relative to the peak."""
 END: Final = 1e-3
+SLICE: Final = 1 << 16
+"""Parameters that are updated at once: what is touched stays in a core's cache."""
+
+Run = Callable[[Callable[[slice], None], Iterable[slice]], Iterable[None]]
+"""Such as `map`, or that of a pool."""
 
 
 @dataclass
@@ -37,12 +43,28 @@ class Adam:
         """The same on another device."""
         return type(self)(self.parameters.to(device), self.mean.to(device), self.square.to(device))
 
-    def update(self, gradient: Tensor, rate: float, step: int) -> None:
-        """One update in place; `step` counts from 1."""
-        self.mean.lerp_(gradient, 1.0 - BETA_1)
-        self.square.mul_(BETA_2).addcmul_(gradient, gradient, value=1.0 - BETA_2)
-        denominator = (self.square / (1.0 - BETA_2**step)).sqrt_().add_(EPSILON)
-        self.parameters.addcdiv_(self.mean, denominator, value=-rate / (1.0 - BETA_1**step))
+    def update(self, gradients: Sequence[Tensor], rate: float, step: int, run: Run) -> None:
+        """One update in place by the sum of `gradients`, added in order; `step` counts from 1.
+
+        `run` maps a function over slices of the vector, on any number of threads.
+        """
+
+        def update(part: slice) -> None:
+            gradient = gradients[0][part].clone()
+            for other in gradients[1:]:
+                gradient += other[part]
+            self._update(part, gradient, rate, step)
+
+        size = self.parameters.numel()
+        for _ in run(update, [slice(start, start + SLICE) for start in range(0, size, SLICE)]):
+            pass
+
+    def _update(self, part: slice, gradient: Tensor, rate: float, step: int) -> None:
+        mean, square = self.mean[part], self.square[part]
+        mean.lerp_(gradient, 1.0 - BETA_1)
+        square.mul_(BETA_2).addcmul_(gradient, gradient, value=1.0 - BETA_2)
+        denominator = (square / (1.0 - BETA_2**step)).sqrt_().add_(EPSILON)
+        self.parameters[part].addcdiv_(mean, denominator, value=-rate / (1.0 - BETA_1**step))
 
 
 def one_cycle(step: int, steps: int, peak: float) -> float:

@@ -1,5 +1,6 @@
 """A pool whose torch kernels run on one thread each, so that results do not depend on how many threads there are.
 
+Denormal numbers are flushed to zero: Adam's moments of dead features decay into them, and they are slow.
 torch keeps the number of kernel threads partly per thread and partly per process; both are set, and the caller's
 number comes back when the pool closes.
 """
@@ -17,7 +18,12 @@ def single_threaded_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor(threads, "fit", initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        with ThreadPoolExecutor(threads, "fit", initializer=_prepare_thread) as pool:
             yield pool
     finally:
         torch.set_num_threads(before)
+
+
+def _prepare_thread() -> None:
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)

@@ -7,11 +7,11 @@ come from (seed, step), the order of texels from `stream`, and a checkpoint hold
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +47,9 @@ NO_SIGNAL: Final = 1e-10
 _CHECKPOINT: Final = "fit-checkpoint"
 _PIXEL_STREAM: Final = 0x706978
 """Tells the random numbers of the pixels from the others of the same seed."""
+
+_In = TypeVar("_In")
+_Out = TypeVar("_Out")
 
 
 @dataclass(frozen=True)
@@ -153,20 +156,15 @@ class _Trainer:
         def gradient(part: npt.NDArray[np.int64]) -> tuple[float, Tensor]:
             return self._gradient(batch.images[part], batch.normals[part], sample, len(batch.images))
 
-        results = self._map(gradient, [part for part in parts if len(part)])
-        total = results[0][1]
-        for _, part in results[1:]:
-            total += part
+        results = list(self._run(gradient, [part for part in parts if len(part)]))
         rate = one_cycle(state.step, settings.steps, settings.learning_rate)
         state.step += 1
-        state.adam.update(total, rate, state.step)
+        state.adam.update([part for _, part in results], rate, state.step, self._run)
         _extend_curve(state, sum(loss for loss, _ in results), settings.steps)
 
-    def _map(
-        self, work: Callable[[npt.NDArray[np.int64]], tuple[float, Tensor]], parts: list[npt.NDArray[np.int64]]
-    ) -> list[tuple[float, Tensor]]:
-        # One stream of kernels keeps a GPU busy; its results are added in the same order.
-        return [work(part) for part in parts] if self._device.type == "cuda" else list(self._pool.map(work, parts))
+    def _run(self, work: Callable[[_In], _Out], parts: Iterable[_In]) -> Iterable[_Out]:
+        """Map over the pool; one after the other on a GPU, which one stream of kernels keeps busy."""
+        return map(work, parts) if self._device.type == "cuda" else self._pool.map(work, parts)
 
     def _gradient(self, images: Float16, normals: Float32, sample: Sample, batch: int) -> tuple[float, Tensor]:
         """Loss and flat gradient [P] of a micro-batch, as its share of a batch of `batch` texels."""
