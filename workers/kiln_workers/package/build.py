@@ -74,6 +74,8 @@ class EnvironmentTextures:
     """[A, R, R, 3] octahedral maps of U(direction, alpha)."""
     u_alphas: Sequence[float]
     """Ascending alpha of each layer."""
+    u_integrals: Sequence[float]
+    """Integral of D(h) alone for each layer: U / integral is a mean of radiance."""
     u_normalised: bool
     """Whether U was divided by the integral of D(h); the paper's is not."""
 
@@ -85,7 +87,7 @@ class PackageInput:
     payload: PackagePayload
     scene: Scene
     texel_map: TexelMapLike
-    irradiance: Float32  # [H, W, 3] W/m^2; anything outside valid texels
+    irradiance: Float32  # [H, W, 3] radiance times sr; anything outside valid texels
     lobes: Mapping[Function, LobeMap]
     metrics: Mapping[Function, FitMetrics]
     """Errors of the lobes as stored (`half.as_stored`), for each function of `lobes`."""
@@ -199,7 +201,7 @@ def _write_lobes(package: _Package, function: Function, lobe_map: LobeMap, fill:
 
 
 def _write_irradiance(package: _Package, irradiance: Float32) -> None:
-    unit = "W/m^2, linear Rec.709"
+    unit = "radiance times sr (W/m^2), linear Rec.709"
     exr.write_rgb(package.folder / IRRADIANCE_EXR, irradiance, comments=f"irradiance, {unit}")
     package.add(IRRADIANCE_EXR)
     texture = ktx2.texture_2d(package.half(irradiance), {"lightkiln.unit": unit})
@@ -223,6 +225,7 @@ def _write_environment(package: _Package, environment: EnvironmentTextures) -> N
     description = {
         "channels": ["r", "g", "b", "1"],
         "alphas": alphas,
+        "lobe_integrals": [float(integral) for integral in environment.u_integrals],
         "normalised": environment.u_normalised,
         "projection": "octahedral",
     }
