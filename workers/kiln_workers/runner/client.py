@@ -22,6 +22,7 @@ from pydantic import ValidationError
 
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import InternalError, KilnError, Problem, Unreachable
+from kiln_schemas.job import MissingReply
 from kiln_schemas.tasks import (
     Checkpoint,
     Claim,
@@ -131,8 +132,10 @@ class CoordinatorClient:
         size = len(source) if isinstance(source, bytes) else source.stat().st_size
 
         def attempt() -> httpx.Response:
-            if self._http.head(f"/v1/blobs/{sha256}").is_success:
-                return httpx.Response(httpx.codes.OK)
+            # Asking also keeps the blob from being collected as garbage before the commit names it.
+            known = self._http.post("/v1/blobs/missing", json={"sha256": [sha256]})
+            if not known.is_success or not MissingReply.model_validate_json(known.content).missing:
+                return known
             headers = {"Content-Length": str(size), "Content-Type": "application/octet-stream"}
             return self._http.put(f"/v1/blobs/{sha256}", content=_chunks(source), headers=headers, timeout=300)
 

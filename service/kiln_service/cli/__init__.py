@@ -1,0 +1,1 @@
+"""The `lightkiln` command: bake on this machine, or talk to a coordinator anywhere."""

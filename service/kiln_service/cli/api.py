@@ -1,0 +1,174 @@
+"""A client of the coordinator's routes for people and programs (not for workers).
+
+Repeats a call while the coordinator does not answer, up to `patience_s`; errors that it answers with are raised as the
+exceptions of their code (`kiln_schemas.errors`).
+"""
+
+import contextlib
+import hashlib
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+from urllib.parse import quote
+
+import httpx
+from pydantic import TypeAdapter, ValidationError
+
+from kiln_schemas.errors import InternalError, KilnError, Problem, Unreachable
+from kiln_schemas.job import JobPage, JobRequest, JobView, MissingReply, MissingRequest, TaskView
+from kiln_schemas.tasks import Artifact, TaskKind
+
+CHUNK: Final = 1 << 20
+PAUSE_S: Final = (0.1, 2.0)
+AWAY: Final = frozenset({502, 503, 504})
+MISSING_AT_ONCE: Final = 4096
+OnBytes = Callable[[int], None]
+
+
+class Api:
+    """One coordinator as a client sees it."""
+
+    def __init__(self, url: str, token: str, *, patience_s: float = 15.0) -> None:
+        self.url, self._patience_s = url.rstrip("/"), patience_s
+        try:
+            self._http = httpx.Client(
+                base_url=self.url,
+                headers={"Authorization": f"Bearer {token}"},
+                timeout=httpx.Timeout(60.0, connect=5.0),
+            )
+        except httpx.InvalidURL as error:
+            raise Unreachable(f"this is not a URL: {error}", where=url, remedy="Check --url.") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._http.close()
+
+    def ready(self) -> bool:
+        """Whether the coordinator, its database and its storage answer, now."""
+        try:
+            return self._http.get("/readyz", timeout=5).is_success
+        except httpx.TransportError:
+            return False
+
+    def missing(self, hashes: Iterable[str]) -> list[str]:
+        """Those of these blobs that the coordinator does not have."""
+        wanted, found = sorted(set(hashes)), list[str]()
+        for start in range(0, len(wanted), MISSING_AT_ONCE):
+            body = MissingRequest(sha256=tuple(wanted[start : start + MISSING_AT_ONCE]))
+            reply = self._call("POST", "/v1/blobs/missing", json=body.model_dump(mode="json"))
+            found += MissingReply.model_validate_json(reply.content).missing
+        return found
+
+    def put_blob(self, sha256: str, path: Path, on_bytes: OnBytes) -> None:
+        """Upload a file; `on_bytes` is told each piece's size."""
+        headers = {"Content-Length": str(path.stat().st_size), "Content-Type": "application/octet-stream"}
+        self._patiently(
+            lambda: self._http.put(f"/v1/blobs/{sha256}", content=_pieces(path, on_bytes), headers=headers, timeout=300)
+        )
+
+    def submit(self, request: JobRequest) -> JobView:
+        """Submit a job whose files are uploaded."""
+        reply = self._call("POST", "/v1/jobs", json=request.model_dump(mode="json"))
+        return JobView.model_validate_json(reply.content)
+
+    def job(self, job_id: str) -> JobView:
+        return JobView.model_validate_json(self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}").content)
+
+    def jobs(self, limit: int = 50) -> JobPage:
+        """The newest jobs."""
+        return JobPage.model_validate_json(self._call("GET", "/v1/jobs", params={"limit": limit}).content)
+
+    def tasks(self, job_id: str, kind: TaskKind | None = None) -> tuple[TaskView, ...]:
+        """A job's tasks, all or of one kind."""
+        params = {} if kind is None else {"kind": kind.value}
+        reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/tasks", params=params)
+        return TypeAdapter(tuple[TaskView, ...]).validate_json(reply.content)
+
+    def cancel(self, job_id: str) -> JobView:
+        """Ask a job to stop."""
+        return JobView.model_validate_json(self._call("POST", f"/v1/jobs/{quote(job_id, safe='')}/cancel").content)
+
+    def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
+        """What a completed job published."""
+        reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/artifacts")
+        return TypeAdapter(tuple[Artifact, ...]).validate_json(reply.content)
+
+    def download(self, job_id: str, artifact: Artifact, target: Path, on_bytes: OnBytes) -> None:
+        """Write an artifact to `target`; whole and with the right hash, or the next try."""
+        path = f"/v1/jobs/{quote(job_id, safe='')}/artifacts/{quote(artifact.name)}"
+
+        def attempt() -> httpx.Response:
+            digest = hashlib.sha256()
+            with self._http.stream("GET", path) as response, target.open("wb") as file:
+                if not response.is_success:
+                    response.read()
+                    return response
+                for chunk in response.iter_bytes(CHUNK):
+                    digest.update(chunk)
+                    file.write(chunk)
+                    on_bytes(len(chunk))
+            if digest.hexdigest() != artifact.sha256:
+                raise httpx.ReadError(f"{artifact.name} arrived damaged")
+            return response
+
+        self._patiently(attempt)
+
+    def _call(
+        self, method: str, path: str, *, json: Any = None, params: Mapping[str, str | int] | None = None
+    ) -> httpx.Response:
+        return self._patiently(lambda: self._http.request(method, path, json=json, params=params))
+
+    def _patiently(self, attempt: Callable[[], httpx.Response]) -> httpx.Response:
+        """The first answer that is not an outage; the coordinator's errors are raised."""
+        deadline, pause = time.monotonic() + self._patience_s, PAUSE_S[0]
+        while True:
+            try:
+                response = attempt()
+            except httpx.UnsupportedProtocol as error:
+                raise Unreachable(
+                    str(error), where=self.url, remedy="Write the URL with http:// or https://."
+                ) from None
+            except httpx.TransportError as error:
+                reason = str(error) or type(error).__name__
+            else:
+                if response.is_success:
+                    return response
+                if response.status_code not in AWAY:
+                    raise problem_of(response)
+                reason = f"it answers {response.status_code}"
+            if time.monotonic() + pause > deadline:
+                raise Unreachable(
+                    f"the coordinator does not answer ({reason})",
+                    where=self.url,
+                    remedy="Check the URL and whether `lightkiln serve` runs there.",
+                )
+            time.sleep(pause)
+            pause = min(2 * pause, PAUSE_S[1])
+
+
+def problem_of(response: httpx.Response) -> KilnError:
+    """The exception that an answer stands for."""
+    document: Any = None
+    with contextlib.suppress(ValueError):
+        document = response.json()
+    try:
+        return KilnError.from_problem(Problem.model_validate(document))
+    except ValidationError:
+        return InternalError(
+            f"unexpected answer {response.status_code} to {response.request.method} {response.request.url.path}",
+            where=str(response.request.url.host),
+            remedy="Check that this URL is a lightkiln coordinator.",
+        )
+
+
+def _pieces(path: Path, on_bytes: OnBytes) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK):
+            yield chunk
+            on_bytes(len(chunk))

@@ -1,0 +1,340 @@
+"""The `lightkiln` command.
+
+Exit codes: 0 done; 1 a defect of lightkiln; 2 wrong usage; 3 an input (scene, file, setting, id) is wrong; 4 the bake
+failed or the request contradicts the present state; 5 canceled; 6 the coordinator does not answer or refuses the token;
+7 this machine lacks something; 130 interrupted (docs/cli.md, kiln_schemas.errors).
+"""
+
+import os
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, NoReturn
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from kiln_schemas import __version__
+from kiln_schemas.errors import Canceled, KilnError, MachineLacks
+from kiln_schemas.job import JobRequest
+from kiln_schemas.settings import make_settings
+from kiln_schemas.states import FINAL_JOB_STATES, JobState
+from kiln_service.cli import bake as baking
+from kiln_service.cli import options
+from kiln_service.cli.bundle import collect
+from kiln_service.cli.doctor import examine
+from kiln_service.cli.fetch import DISK_FULL, download_package
+from kiln_service.cli.output import (
+    defect,
+    duration,
+    print_error,
+    print_json,
+    results,
+    shown_path,
+    stage_table,
+)
+from kiln_service.cli.progress import follow, make_display, raise_unless_completed
+from kiln_service.cli.upload import upload_and_submit
+
+INTERRUPTED: int = 130
+
+app = typer.Typer(
+    name="lightkiln",
+    help="Bake glossy global illumination into spherical Gaussian light-field textures.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+examples_app = typer.Typer(help="Example scenes.", no_args_is_help=True)
+app.add_typer(examples_app, name="examples")
+
+
+@app.callback(invoke_without_command=True)
+def root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        print(__version__)
+        raise typer.Exit
+
+
+@app.command()
+def bake(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the package.")],
+    scene: Annotated[
+        str | None, typer.Argument(metavar="SCENE", help="GLB, glTF, OBJ, PLY or Mitsuba XML; or gallery, courtyard.")
+    ] = None,
+    env: options.Environment = None,
+    env_scale: options.EnvironmentScale = 1.0,
+    env_rotation: options.EnvironmentRotation = 0.0,
+    preset: options.Preset = "preview",
+    overrides: options.Overrides = None,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, max=256, help="Local workers.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the interrupted bake in DIR.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace what is in DIR.")] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep DIR/.lightkiln: the store, the database, logs.")] = False,
+    json: options.Json = False,
+) -> None:
+    """Bake a scene on this machine: starts everything, shows progress, cleans up."""
+    summary = baking.bake(
+        baking.BakeOptions(
+            scene=scene,
+            out=out,
+            environment=env,
+            environment_scale=env_scale,
+            environment_rotation_deg=env_rotation,
+            preset=preset,
+            overrides=tuple(overrides or ()),
+            workers=workers,
+            resume=resume,
+            force=force,
+            keep=keep,
+        )
+    )
+    if json:
+        print_json(summary)
+        return
+    if summary.already_done:
+        results.print(f"This bake is already done: the same files and settings are in {escape(str(out))}.")
+    else:
+        spans = ", ".join(f"{kind} {duration(s)}" for kind, s in summary.stage_wall_seconds.items())
+        results.print(f"Baked in {duration(summary.seconds)} ({spans}).")
+        for note in summary.notes:
+            results.print(f"note: {note}", markup=False)
+    for word, path in (("package", summary.out), ("manifest", summary.manifest), ("report", summary.report)):
+        if path is not None:
+            results.print(f"{word:9} {shown_path(Path(path).absolute())}", markup=False, soft_wrap=True)
+    if summary.report is not None:
+        results.print("The pictures are in the report: open it in a browser.")
+
+
+@app.command()
+def serve(
+    data: Annotated[Path, typer.Option("--data", metavar="DIR", help="Folder for the database, blobs, token, stores.")],
+    port: Annotated[int, typer.Option("--port", help="0 takes a free one.")] = 8321,
+    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
+    database: Annotated[
+        str | None, typer.Option("--database", metavar="DSN", help="PostgreSQL; an embedded one by default.")
+    ] = None,
+    store: Annotated[
+        str | None, typer.Option("--store", metavar="URL", help="Light-field stores: file:// or s3://.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option("--config", metavar="FILE", help="JSON with all settings.")] = None,
+    json: options.Json = False,
+) -> None:
+    """Run a coordinator."""
+    command = ["--host", host, "--port", str(port), "--data", str(data)]
+    for flag, value in (("--database", database), ("--store", store), ("--config", config)):
+        command += [flag, str(value)] if value is not None else []
+    _become("kiln_service", [*command, *(["--json"] if json else [])])
+
+
+@app.command()
+def worker(
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    token_file: Annotated[Path | None, typer.Option("--token-file", help="File that holds the token.")] = None,
+    data: options.Data = None,
+    kinds: Annotated[
+        str, typer.Option("--kinds", help="Kinds of tasks to take, separated by commas.")
+    ] = "prepare,render,fit,package",
+    memory: Annotated[str | None, typer.Option("--memory", help="Main memory to use, e.g. 4GiB.")] = None,
+    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Cores to use; all by default.")] = None,
+    name: Annotated[str | None, typer.Option("--name", help="As the dashboard shows it.")] = None,
+    scratch: Annotated[Path | None, typer.Option("--scratch", help="Folder for temporary files.")] = None,
+    json: options.Json = False,
+) -> None:
+    """Work for a coordinator until told to stop."""
+    # The token goes by the environment: command lines are visible to every user of the machine.
+    if token_file is None:
+        os.environ["LIGHTKILN_TOKEN"] = token or options.read_token(data)
+    command = ["worker", "--url", url, "--kinds", kinds]
+    flags = (("--token-file", token_file), ("--memory", memory), ("--threads", threads), ("--name", name))
+    for flag, value in (*flags, ("--scratch", scratch)):
+        command += [flag, str(value)] if value is not None else []
+    _become("kiln_workers", [*command, *(["--json"] if json else [])])
+
+
+@app.command()
+def submit(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE")],
+    env: options.Environment = None,
+    env_scale: options.EnvironmentScale = 1.0,
+    env_rotation: options.EnvironmentRotation = 0.0,
+    preset: options.Preset = "preview",
+    overrides: options.Overrides = None,
+    name: Annotated[str | None, typer.Option("--name", help="The job's name; the file's by default.")] = None,
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Upload a scene and submit a job to a coordinator."""
+    make_settings(preset, overrides or ())
+    local = collect(scene, env, scale=env_scale, rotation_deg=env_rotation)
+    request = JobRequest(name=name or scene.stem[:128], bundle=local.bundle, preset=preset, set=tuple(overrides or ()))
+    with options.connect(url, token, data) as api:
+        job = upload_and_submit(api, local, request)
+    if json:
+        print_json(job)
+    else:
+        results.print(job.id, markup=False)
+
+
+@app.command()
+def status(
+    job: Annotated[str | None, typer.Argument(metavar="JOB", help="All recent jobs without it.")] = None,
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Show one job, or the newest ones."""
+    with options.connect(url, token, data) as api:
+        if job is None:
+            page = api.jobs()
+            if json:
+                print_json(page)
+                return
+            table = Table("job", "name", "state", "created", box=None)
+            for view in page.jobs:
+                table.add_row(view.id, escape(view.name), view.state.value, f"{view.created:%Y-%m-%d %H:%M}")
+            results.print(table)
+            return
+        view = api.job(job)
+    if json:
+        print_json(view)
+        return
+    left = f", about {duration(view.remaining_s)} left" if view.remaining_s is not None else ""
+    results.print(f"{view.name}: {view.state.value}{left}", markup=False)
+    results.print(stage_table(view))
+    if view.error is not None:
+        results.print(view.error.sentence(), markup=False, soft_wrap=True)
+
+
+@app.command()
+def watch(
+    job: options.JobId,
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: Annotated[bool, typer.Option("--json", help="One JSON document a line at every change.")] = False,
+) -> None:
+    """Follow a job until it is over; the exit code tells how it ended."""
+    with options.connect(url, token, data) as api, make_display(quiet=json) as display:
+        view = follow(api, job, display, on_change=print_json if json else None)
+    if json and view.state is not JobState.COMPLETED:
+        # The last line already tells the error; only the code is missing.
+        ended = KilnError.from_problem(view.error) if view.error else Canceled("the job was canceled")
+        raise typer.Exit(ended.exit_code)
+    raise_unless_completed(view)
+
+
+@app.command()
+def cancel(
+    job: options.JobId,
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Ask a job to stop."""
+    with options.connect(url, token, data) as api:
+        view = api.cancel(job)
+    if json:
+        print_json(view)
+    else:
+        results.print(f"{view.name}: {view.state.value}", markup=False)
+
+
+@app.command()
+def download(
+    job: options.JobId,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the package.")],
+    force: Annotated[bool, typer.Option("--force", help="Replace the package in DIR.")] = False,
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Download a completed job's package."""
+    with options.connect(url, token, data) as api:
+        view = api.job(job)
+        if view.state in FINAL_JOB_STATES:
+            raise_unless_completed(view)
+        files = download_package(api, job, out, force=force)
+    if json:
+        print_json({"out": str(out), "files": [str(path.relative_to(out)) for path in files]})
+    else:
+        results.print(f"{len(files)} files in {shown_path(out.absolute())}", markup=False)
+
+
+@app.command()
+def doctor(
+    data: Annotated[Path, typer.Option("--data", help="Folder where a bake's data would go.")] = Path(),
+    json: options.Json = False,
+) -> None:
+    """Say what this machine can do and how to mend what it lacks."""
+    checks = examine(data.absolute())
+    if json:
+        print_json([check.model_dump() for check in checks])
+    else:
+        colours = {"ok": "green", "warn": "yellow", "fail": "bold red"}
+        table = Table("", "check", "finding", box=None)
+        for check in checks:
+            remedy = f"\n{check.remedy}" if check.remedy else ""
+            mark = f"[{colours[check.status]}]{check.status}[/]"
+            table.add_row(mark, check.name, escape(check.detail + remedy))
+        results.print(table)
+    if any(check.status == "fail" for check in checks):
+        raise typer.Exit(MachineLacks.exit_code)
+
+
+@examples_app.command("write")
+def examples_write(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Made where it is missing.")],
+    json: options.Json = False,
+) -> None:
+    """Write the example scenes, gallery and courtyard, as GLB and EXR."""
+    files = [str(path) for path in baking.write_examples(folder)]
+    if json:
+        print_json({"files": files})
+    else:
+        results.print("\n".join(files), markup=False, soft_wrap=True)
+
+
+def main() -> NoReturn:
+    """Run the command line and exit with the documented code; users see sentences, never tracebacks."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    as_json = "--json" in sys.argv
+    try:
+        app()
+    except KilnError as error:
+        _leave(error, as_json=as_json)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    except OSError as error:
+        if error.errno in DISK_FULL:
+            full = MachineLacks("the disk is full", where=error.filename, remedy="Free space and try again.")
+            _leave(full, as_json=as_json)
+        _leave(defect(error), as_json=as_json)
+    except Exception as error:
+        _leave(defect(error), as_json=as_json)
+    sys.exit(0)
+
+
+def _leave(error: KilnError, *, as_json: bool) -> NoReturn:
+    print_error(error, as_json=as_json)
+    sys.exit(error.exit_code)
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    """SIGTERM is treated as Ctrl-C, so that everything that was started is stopped."""
+    raise KeyboardInterrupt
+
+
+def _become(module: str, arguments: list[str]) -> NoReturn:
+    """Turn into `python -m module`: signals, exit code and output are then that process's own."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, "-m", module, *arguments])

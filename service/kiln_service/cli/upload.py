@@ -1,0 +1,20 @@
+"""Send a bundle: only the files that the coordinator lacks, with a bar, then the job."""
+
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
+
+from kiln_schemas.job import JobRequest, JobView
+from kiln_service.cli.api import Api
+from kiln_service.cli.bundle import LocalBundle
+from kiln_service.cli.output import notices
+
+
+def upload_and_submit(api: Api, local: LocalBundle, request: JobRequest, *, bar: bool = True) -> JobView:
+    """Upload what is missing, with a bar on a terminal if `bar`, and submit."""
+    files = local.by_hash()
+    missing = api.missing(files)
+    columns = (TextColumn("uploading"), BarColumn(), DownloadColumn())
+    with Progress(*columns, console=notices, transient=True, disable=not (bar and notices.is_terminal)) as shown:
+        row = shown.add_task("uploading", total=sum(files[sha256].stat().st_size for sha256 in missing))
+        for sha256 in missing:
+            api.put_blob(sha256, files[sha256], lambda size: shown.advance(row, size))
+    return api.submit(request)
