@@ -1,0 +1,41 @@
+"""Fit one function: stream the rendered tiles through the network until it is trained."""
+
+from kiln_schemas.tasks import FitPayload, FitResult, Progress
+from kiln_workers.fit.source import StoreSource
+from kiln_workers.fit.train import train
+from kiln_workers.runner.context import Context
+from kiln_workers.scene.texel_map import unpack_texel_map
+from kiln_workers.stages.tiles import with_render_verdict
+from kiln_workers.store.light_field import LightFieldStore
+
+
+def run(payload: FitPayload, context: Context) -> FitResult:
+    """Train from the store, going on from the last published checkpoint where there is one."""
+    texel_map = with_render_verdict(unpack_texel_map(context.blob(payload.texel_map)), payload.renders)
+    tiles = sorted((render.tile for render in payload.renders), key=lambda tile: (tile.row, tile.column))
+    store = LightFieldStore.open(payload.store_url)
+    source = StoreSource(store, payload.function, texel_map.state, texel_map.normal, tiles)
+
+    def on_progress(at: Progress) -> None:
+        context.progress(at.done, at.total, at.unit, at.message, at.loss)
+
+    outcome = train(
+        source,
+        payload.settings.fit,
+        payload.function,
+        payload.settings.seed,
+        threads=context.threads,
+        checkpoint=context.last_checkpoint(),
+        on_checkpoint=context.checkpoint,
+        on_progress=on_progress,
+    )
+    context.log(f"{payload.function.value}: log_mse_rel {outcome.metrics.log_mse_rel:.4f}")
+    return FitResult(
+        function=payload.function,
+        weights=context.put_blob(outcome.weights),
+        exposure=outcome.exposure,
+        metrics=outcome.metrics,
+        curve=outcome.curve,
+        steps=outcome.steps,
+        seconds=outcome.seconds,
+    )

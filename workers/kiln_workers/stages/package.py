@@ -1,0 +1,179 @@
+"""Make the package: run the networks over all texels, judge what they give, write and upload every file."""
+
+import platform
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from kiln_schemas import __version__
+from kiln_schemas.settings import Function, PackageSettings
+from kiln_schemas.tasks import FitMetrics, FitResult, PackagePayload, PackageResult, Tile
+from kiln_workers.fit.metrics import TexelErrors, texel_errors
+from kiln_workers.fit.predict import Weights, predict
+from kiln_workers.fit.source import valid_texels
+from kiln_workers.package.build import EnvironmentTextures, LobeMap, PackageInput, build_package
+from kiln_workers.package.half import as_stored
+from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelPreview, choose_texels
+from kiln_workers.render.environment import environment_u, ggx_prefilter
+from kiln_workers.runner.context import Context
+from kiln_workers.scene.archive import unpack_scene
+from kiln_workers.scene.model import Environment
+from kiln_workers.scene.picture import texel_map_picture
+from kiln_workers.scene.texel_map import TexelMap, unpack_texel_map
+from kiln_workers.sphere.gaussian import evaluate
+from kiln_workers.sphere.octahedral import pixel_directions
+from kiln_workers.stages.tiles import map_coordinates, with_render_verdict
+from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
+from kiln_workers.store.light_field import LightFieldStore
+
+Float16 = npt.NDArray[np.float16]
+Float32 = npt.NDArray[np.float32]
+
+U_ROUGHNESS: Final = np.linspace(0.1, 1.0, 10)
+"""Perceptual roughness of the layers of environment_u.ktx2."""
+
+LEAST_MIP: Final = 4
+"""Side of the GGX cube's smallest mip."""
+
+TEXELS_AT_ONCE: Final = 256
+
+LIBRARIES: Final = ("mitsuba", "drjit", "torch", "numpy", "tensorstore", "OpenEXR", "OpenImageIO", "xatlas")
+
+
+def run(payload: PackagePayload, context: Context) -> PackageResult:
+    """All artifacts of a job, uploaded as blobs."""
+    began = time.perf_counter()
+    scene = unpack_scene(context.blob(payload.prepare.scene))
+    texel_map = with_render_verdict(unpack_texel_map(context.blob(payload.prepare.texel_map)), payload.renders)
+    store = LightFieldStore.open(payload.store_url)
+    store.write_texel_map({name: getattr(texel_map, name) for name in TEXEL_MAP_ARRAYS})
+    tiles = tuple(sorted((render.tile for render in payload.renders), key=lambda tile: (tile.row, tile.column)))
+
+    lobes: dict[Function, LobeMap] = {}
+    metrics: dict[Function, FitMetrics] = {}
+    previews: dict[Function, FunctionPreview] = {}
+    for number, fit in enumerate(payload.fits):
+        context.progress(number, len(payload.fits) + 2, "steps", f"evaluating the {fit.function.value}")
+        judged = _judge(fit, _Texels(store, texel_map, tiles, fit.function), context)
+        lobes[fit.function], metrics[fit.function], previews[fit.function] = judged
+
+    context.progress(len(payload.fits), len(payload.fits) + 2, "steps", "convolving the environment")
+    environment = _convolve(scene.environment, payload.settings.package) if scene.environment else None
+
+    context.progress(len(payload.fits) + 1, len(payload.fits) + 2, "steps", "writing the package")
+    folder = context.scratch / "package"
+    folder.mkdir()
+    artifacts = build_package(
+        folder,
+        PackageInput(
+            payload=payload,
+            scene=scene,
+            texel_map=texel_map,
+            irradiance=store.read_irradiance(),
+            lobes=lobes,
+            metrics=metrics,
+            preview=PackagePreview(atlas=texel_map_picture(texel_map), functions=previews),
+            environment=environment,
+            stage_seconds=_stage_seconds(payload, time.perf_counter() - began),
+            versions=_versions(),
+        ),
+    )
+    for artifact in artifacts:
+        context.put_blob(folder / artifact.name)
+    return PackageResult(artifacts=tuple(artifacts), seconds=time.perf_counter() - began)
+
+
+@dataclass(frozen=True)
+class _Texels:
+    """The valid texels of one function, tile by tile."""
+
+    store: LightFieldStore
+    map: TexelMap
+    tiles: tuple[Tile, ...]
+    function: Function
+
+    def batches(self) -> Iterator[tuple[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]], Float16, Float32]]:
+        """(rows, columns), images [T, R, R, 3] and normals [T, 3] of at most TEXELS_AT_ONCE texels at a time."""
+        for tile in self.tiles:
+            inside = valid_texels(self.map.state, tile)
+            for start in range(0, len(inside), TEXELS_AT_ONCE):
+                part = inside[start : start + TEXELS_AT_ONCE]
+                place = map_coordinates(tile, part)
+                yield place, self.store.read_tile(self.function, tile, part), self.map.normal[place]
+
+    def image(self, row: int, column: int) -> Float16:
+        """One texel's image [R, R, 3]."""
+        tile = next(t for t in self.tiles if 0 <= row - t.row < t.size and 0 <= column - t.column < t.size)
+        inside = np.array([(row - tile.row) * tile.size + column - tile.column])
+        return np.asarray(self.store.read_tile(self.function, tile, inside)[0])
+
+
+def _judge(fit: FitResult, texels: _Texels, context: Context) -> tuple[LobeMap, FitMetrics, FunctionPreview]:
+    """Lobes of every valid texel as the texture will hold them, their errors, and the texels to show."""
+    weights = Weights.from_bytes(context.blob(fit.weights))
+    shape = texels.map.state.shape
+    lobes = np.zeros((*shape, weights.shape.lobes, 7), np.float32)
+    mask = np.zeros(shape, bool)
+    per_texel = np.full(shape, np.nan, np.float32)
+    parts = []
+    for place, images, normals in texels.batches():
+        stored = as_stored(predict(weights, images, normals, threads=context.threads))
+        errors = texel_errors(stored, images, normals, weights.exposure)
+        lobes[place], mask[place] = stored, True
+        per_texel[place] = errors.error / errors.weight
+        parts.append(errors)
+    total = TexelErrors.join(parts)
+    metrics = FitMetrics(
+        log_mse=total.log_mse,
+        log_mse_zero=total.log_mse_zero,
+        log_mse_rel=total.log_mse_rel,
+        texels=len(total.error),
+        signal=fit.metrics.signal,
+    )
+    best, median, worst = (_preview(texels, lobes, per_texel, at) for at in choose_texels(per_texel))
+    return LobeMap(lobes, mask), metrics, FunctionPreview(best, median, worst, per_texel)
+
+
+def _preview(texels: _Texels, lobes: Float32, errors: Float32, at: tuple[int, int]) -> TexelPreview:
+    original = texels.image(*at).astype(np.float32)
+    size = original.shape[0]
+    predicted = evaluate(pixel_directions(size).reshape(-1, 3), lobes[at].astype(np.float64))
+    x, y, z = (float(value) for value in texels.map.normal[at])
+    return TexelPreview(
+        row=at[0],
+        column=at[1],
+        log_mse=float(errors[at]),
+        normal=(x, y, z),
+        original=original,
+        predicted=predicted.reshape(size, size, 3).astype(np.float32),
+    )
+
+
+def _convolve(environment: Environment, settings: PackageSettings) -> EnvironmentTextures:
+    """The environment's two preconvolved textures (light-field paper, eq. 6, and the split sum)."""
+    size = settings.environment_size
+    mips = int(np.log2(size / LEAST_MIP)) + 1
+    alphas = U_ROUGHNESS**2
+    layers, _ = environment_u(environment, alphas, size)
+    return EnvironmentTextures(
+        ggx_mips=ggx_prefilter(environment, size, mips),
+        u_layers=layers,
+        u_alphas=alphas.tolist(),
+        u_normalised=False,
+    )
+
+
+def _stage_seconds(payload: PackagePayload, package: float) -> Mapping[str, float]:
+    """Busy seconds of each stage, added up over its tasks; `package` up to the writing of the manifest."""
+    fits = {f"fit {fit.function.value}": fit.seconds for fit in payload.fits}
+    render = sum(result.seconds for result in payload.renders)
+    return {"prepare": payload.prepare.seconds, "render": render, **fits, "package": package}
+
+
+def _versions() -> Mapping[str, str]:
+    return {"lightkiln": __version__, "python": platform.python_version()} | {name: version(name) for name in LIBRARIES}

@@ -1,0 +1,84 @@
+"""Read the scene, give it a light map, lay out the store: everything the farm needs before the first ray."""
+
+import time
+from pathlib import Path
+from typing import Final
+
+from kiln_schemas.errors import InputError
+from kiln_schemas.job import check_bundle
+from kiln_schemas.settings import BakeSettings, Function
+from kiln_schemas.tasks import Bundle, PreparePayload, PrepareResult
+from kiln_workers.runner.context import Context
+from kiln_workers.scene.archive import pack_scene, scene_hash
+from kiln_workers.scene.atlas import assign_lightmap_uv
+from kiln_workers.scene.load import check_light, load_scene
+from kiln_workers.scene.model import Scene
+from kiln_workers.scene.texel_map import TexelMap, pack_texel_map
+from kiln_workers.scene.texels import build_texel_map
+from kiln_workers.stages.tiles import plan_tiles
+from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
+from kiln_workers.store.light_field import LightFieldStore
+
+STEPS: Final = ("fetching the scene", "reading the scene", "laying out the light map", "placing the texels", "saving")
+
+
+def run(payload: PreparePayload, context: Context) -> PrepareResult:
+    """Scene bundle in; parsed scene, texel map, empty store and tiles out."""
+    began = time.perf_counter()
+    settings, bundle = payload.settings, check_bundle(payload.bundle)
+
+    def step(index: int) -> None:
+        context.progress(index, len(STEPS), "steps", STEPS[index])
+
+    step(0)
+    folder = _lay_out(bundle, context)
+    step(1)
+    scene = check_light(load_scene(folder, bundle.entry, bundle.environment))
+    step(2)
+    scene = assign_lightmap_uv(scene, settings.lightmap)
+    step(3)
+    texel_map = build_texel_map(scene, settings.lightmap.resolution)
+    tiles = plan_tiles(texel_map, settings.lightmap.tile)
+    if not tiles:
+        raise InputError(
+            "no texel of the light map is covered",
+            where=bundle.entry,
+            remedy="Check the size of its light-map charts.",
+        )
+    step(4)
+    digest = scene_hash(scene, settings.render)
+    _create_store(payload.store_url, scene, texel_map, digest, settings)
+    context.log(f"{scene.triangles} triangles, {texel_map.covered} texels in {len(tiles)} tiles")
+    return PrepareResult(
+        scene=context.put_blob(pack_scene(scene)),
+        texel_map=context.put_blob(pack_texel_map(texel_map)),
+        scene_hash=digest,
+        tiles=tiles,
+        has_environment=scene.environment is not None,
+        has_light=scene.has_light,
+        triangles=scene.triangles,
+        notes=scene.notes,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _lay_out(bundle: Bundle, context: Context) -> Path:
+    """The bundle as files in a folder; every path was checked to stay inside."""
+    folder = context.scratch / "bundle"
+    for path, sha256 in sorted(bundle.files.items()):
+        target = folder / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(context.blob(sha256))
+    return folder
+
+
+def _create_store(url: str, scene: Scene, texel_map: TexelMap, digest: str, settings: BakeSettings) -> None:
+    store = LightFieldStore.create(
+        url,
+        shape=(settings.lightmap.resolution, settings.lightmap.resolution),
+        image_size=settings.render.image_size,
+        tile=settings.lightmap.tile,
+        functions=[Function.LIGHT_FIELD] + ([Function.VISIBILITY] if scene.environment else []),
+        attributes={"scene_hash": digest, "settings": settings.model_dump(mode="json")},
+    )
+    store.write_texel_map({name: getattr(texel_map, name) for name in TEXEL_MAP_ARRAYS})

@@ -1,0 +1,49 @@
+"""Which texels a tile holds, and which of them count: the one place where tiles meet the texel map."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from kiln_schemas.tasks import RenderResult, Tile
+from kiln_workers.scene.texel_map import TexelMap, TexelState
+
+Ints = npt.NDArray[np.int64]
+
+BACK_FACE_LIMIT: Final = 0.5
+"""A texel of whose primary rays more than this fraction meet a back face lies inside something: it is invalid."""
+
+
+def plan_tiles(texel_map: TexelMap, size: int) -> tuple[Tile, ...]:
+    """Tiles of `size` x `size` texels, row by row, that hold at least one surface point."""
+    height, width = texel_map.state.shape
+    tiles = []
+    for row in range(0, height, size):
+        for column in range(0, width, size):
+            texels = int(np.count_nonzero(texel_map.state[row : row + size, column : column + size]))
+            if texels:
+                tiles.append(Tile(row=row, column=column, size=size, texels=texels))
+    return tuple(tiles)
+
+
+def covered_texels(texel_map: TexelMap, tile: Tile) -> Ints:
+    """Row-major indices inside the tile [T] of its texels with a surface point, ascending."""
+    part = texel_map.state[tile.row : tile.row + tile.size, tile.column : tile.column + tile.size]
+    rows, columns = np.nonzero(part != TexelState.GUTTER)
+    return np.asarray(rows * tile.size + columns, dtype=np.int64)
+
+
+def map_coordinates(tile: Tile, inside: Ints) -> tuple[Ints, Ints]:
+    """Rows and columns in the light map of row-major indices inside a tile."""
+    rows, columns = np.divmod(inside, tile.size)
+    return rows + tile.row, columns + tile.column
+
+
+def with_render_verdict(texel_map: TexelMap, renders: Iterable[RenderResult]) -> TexelMap:
+    """The texel map with the texels that rendering found inside other geometry marked invalid."""
+    state = texel_map.state.copy()
+    for render in renders:
+        state[map_coordinates(render.tile, np.asarray(render.invalid_texels, dtype=np.int64))] = TexelState.INVALID
+    return replace(texel_map, state=state)
