@@ -159,11 +159,12 @@ def _convolve(environment: Environment, settings: PackageSettings) -> Environmen
     size = settings.environment_size
     mips = int(np.log2(size / LEAST_MIP)) + 1
     alphas = U_ROUGHNESS**2
-    layers, _ = environment_u(environment, alphas, size)
+    layers, integrals = environment_u(environment, alphas, size)
     return EnvironmentTextures(
         ggx_mips=ggx_prefilter(environment, size, mips),
         u_layers=layers,
         u_alphas=alphas.tolist(),
+        u_integrals=integrals.tolist(),
         u_normalised=False,
     )
 
