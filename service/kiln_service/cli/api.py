@@ -6,6 +6,7 @@ exceptions of their code (`kiln_schemas.errors`).
 
 import contextlib
 import hashlib
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -16,7 +17,7 @@ from urllib.parse import quote
 import httpx
 from pydantic import TypeAdapter, ValidationError
 
-from kiln_schemas.errors import InternalError, KilnError, Problem, Unreachable
+from kiln_schemas.errors import AuthError, InternalError, KilnError, Problem, Unreachable
 from kiln_schemas.job import JobPage, JobRequest, JobView, MissingReply, MissingRequest, TaskView
 from kiln_schemas.tasks import Artifact, TaskKind
 
@@ -28,14 +29,16 @@ OnBytes = Callable[[int], None]
 
 
 class Api:
-    """One coordinator as a client sees it."""
+    """One coordinator as a client sees it. Without a token only `ready` is answered."""
 
-    def __init__(self, url: str, token: str, *, patience_s: float = 15.0) -> None:
+    def __init__(self, url: str, token: str | None, *, patience_s: float = 15.0) -> None:
         self.url, self._patience_s = url.rstrip("/"), patience_s
+        if token is not None and not re.fullmatch(r"[\x21-\x7e]+", token):
+            raise AuthError("the token has characters that no token has", remedy="Pass it as it is in the token file.")
         try:
             self._http = httpx.Client(
                 base_url=self.url,
-                headers={"Authorization": f"Bearer {token}"},
+                headers={"Authorization": f"Bearer {token}"} if token else {},
                 timeout=httpx.Timeout(60.0, connect=5.0),
             )
         except httpx.InvalidURL as error:

@@ -95,8 +95,6 @@ def bake(options: BakeOptions) -> Summary:
     """Bake; the summary of what is in `options.out`."""
     began = time.monotonic()
     data = options.out / DATA
-    with writing(options.out):
-        options.out.mkdir(parents=True, exist_ok=True)
     record = _resumed(options, data) if options.resume else _planned(options)
     local = _collect(record)
     if record.request.bundle != local.bundle:

@@ -160,7 +160,7 @@ class LocalFarm:
         """Start the coordinator, wait until it is ready, start the workers."""
         self.coordinator.start()
         deadline = time.monotonic() + READY_TIMEOUT_S
-        with Api(self.url, "", patience_s=0) as api:
+        with Api(self.url, None, patience_s=0) as api:
             while not api.ready():
                 if time.monotonic() > deadline:
                     raise MachineLacks(

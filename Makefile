@@ -1,0 +1,42 @@
+# make demo   bake a bundled example and say where the results are
+# make test   everything that has to hold
+# make lint   the static part of it
+# make venv   the virtual environment in .venv that these use
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+.PHONY: help venv demo test lint node clean
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+export PYTHON
+
+help:
+	@sed -n 's/^# //p' Makefile
+
+venv: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml constraints.txt deploy/install/venv.sh deploy/install/libllvm.sh
+	@deploy/install/venv.sh $(VENV) service,worker,dev
+	@deploy/install/libllvm.sh $(VENV)
+	@touch $@
+
+demo: venv
+	@$(BIN)/lightkiln bake gallery --preset draft --out demo --force
+
+lint: venv
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+node:
+	@deploy/install/node.sh
+
+test: lint node
+	$(BIN)/pytest
+
+clean:
+	rm -rf $(VENV) demo demo.partial
