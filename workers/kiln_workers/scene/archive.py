@@ -10,9 +10,9 @@ from dataclasses import asdict, replace
 from typing import Any, Final
 
 import numpy as np
-from kiln_schemas.errors import InputError
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from kiln_schemas.errors import InputError
 from kiln_workers.scene.container import Array, chunks, pack, unpack
 from kiln_workers.scene.model import Environment, Image, Material, Mesh, PunctualLight, Scene
 

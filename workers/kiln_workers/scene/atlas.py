@@ -1,12 +1,12 @@
-"""Light-map UVs for every mesh: keep the scene's own set where it is a unique one, else unwrap all with xatlas.
+"""Light-map UVs for every mesh: keep the scene's own set where it is a unique one, else unwrap all.
 
-A set is usable if every mesh has it, it lies in [0, 1], every face has an area in it, and no two faces overlap. Overlap is
-tested on the faces' interiors, not on shared texels: on a grid four times finer than the light map, a sample
+A set is usable if every mesh has it, it lies in [0, 1], every face has an area in it, and no two faces overlap. Overlap
+is tested on the faces' interiors, not on shared texels: on a grid four times finer than the light map, a sample
 deep inside two faces is overlap, so edges that charts or neighbours share are not. Overlap of up to one texel in all
 passes, as exporters round. Instances that share one set overlap by this test, so a scene with them is unwrapped.
 
-Unwrapping makes one atlas page for the whole scene with one scale (metres a texel), the finest for which all charts fit
-with `padding` empty texels between them; it is found by bisection and is the same on every run.
+Unwrapping makes one atlas for the whole scene with one scale (metres a texel): xatlas cuts the charts (`unwrap`), and
+`packing` finds the finest scale for which all fit with `padding` empty texels between them.
 """
 
 from collections.abc import Sequence
@@ -15,13 +15,14 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import xatlas
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.settings import LightmapSettings, UvPolicy
-from kiln_workers.scene.geometry import Floats, face_areas
+from kiln_workers.scene.geometry import Floats, Ints, face_areas
 from kiln_workers.scene.model import Mesh, Scene
+from kiln_workers.scene.packing import Chart, bounding_turn, pack_charts
 from kiln_workers.scene.raster import interior_samples
+from kiln_workers.scene.unwrap import Unwrapped, cut_into_charts
 
 UV_TOLERANCE: Final = 1e-4
 OVERSAMPLING: Final = 4
@@ -30,11 +31,6 @@ SAMPLES: Final = (512, 4096)
 OVERLAP_TEXELS: Final = 1.0
 FLAT_SHARE: Final = 1e-3
 """Part of a mesh's area that may have no area in the light map."""
-FIT_STEPS: Final = 7
-SMALLEST_SHARE: Final = 0.02
-"""The scale is given up below this part of what a full atlas would have."""
-BRUTE_FORCE_TEXELS: Final = 256
-"""Up to this resolution charts are packed by trying every place."""
 
 
 @dataclass(frozen=True)
@@ -118,82 +114,62 @@ def _overlaps(meshes: Sequence[Mesh], resolution: int) -> list[Fault]:
 
 
 def _unwrapped(scene: Scene, settings: LightmapSettings, reasons: dict[str, str]) -> Scene:
-    atlas, scale = _fitted_atlas(scene.meshes, settings)
-    meshes, notes = [], []
-    for index, mesh in enumerate(scene.meshes):
-        vertex, faces, uv = atlas[index]
-        pages, charts = atlas.get_mesh_vertex_assignment(index)
-        if (pages.astype(np.int64)[faces] != 0).any():
-            raise InputError(
-                "has faces that the unwrapper could not flatten",
-                where=f"mesh '{mesh.name}'",
-                remedy="Give the mesh a light-map UV (TEXCOORD_1) of its own.",
-            )
-        meshes.append(
-            replace(
-                mesh,
-                positions=mesh.positions[vertex],
-                normals=mesh.normals[vertex],
-                faces=faces.astype(np.int32),
-                uv=None if mesh.uv is None else mesh.uv[vertex],
-                lightmap_uv=_page_uv(uv, atlas, settings.resolution),
-            )
-        )
-        why = reasons.get(mesh.name, "asked for" if not reasons else "another mesh has to be")
-        why = f"its set {why}" if mesh.name in reasons else why
-        notes.append(f"Mesh '{mesh.name}': unwrapped into {len(np.unique(charts))} charts ({why}).")
-    notes.append(f"Light map: one texel is {1.0 / scale:.3g} m wide.")
-    return replace(scene, meshes=tuple(meshes), notes=(*scene.notes, *notes))
-
-
-def _fitted_atlas(meshes: Sequence[Mesh], settings: LightmapSettings) -> tuple[xatlas.Atlas, float]:
-    """The atlas of one page at the finest scale found, and that scale in texels a metre."""
-    side = settings.resolution
-    area = sum(float(face_areas(mesh.positions, mesh.faces).sum()) for mesh in meshes)
-    full = side / np.sqrt(area)
-    low, high = 0.0, full
-    best: xatlas.Atlas | None = None
-    scale, best_scale = 0.75 * full, 0.0
-    for _ in range(FIT_STEPS):
-        atlas = _packed(meshes, settings, scale)
-        if atlas.atlas_count == 1:
-            best, best_scale, low = atlas, scale, scale
-        else:
-            high = scale
-        scale = 0.5 * (low + high) if low > 0.0 else 0.6 * scale
-    while best is None and scale > SMALLEST_SHARE * full:
-        atlas = _packed(meshes, settings, scale)
-        best, best_scale = (atlas, scale) if atlas.atlas_count == 1 else (None, 0.0)
-        scale *= 0.6
-    if best is None:
+    parts = cut_into_charts(scene.meshes)
+    counts = [int(part.chart.max()) + 1 for part in parts]
+    flat = [piece for part in parts for piece in _flat_pieces(part)]
+    packed = pack_charts([piece.chart for piece in flat], settings.resolution, settings.padding)
+    if packed is None:
         raise InputError(
-            f"{atlas.chart_count} charts with {settings.padding} texels between them do not fit into"
-            f" {side} x {side} texels",
+            f"{len(flat)} charts with {settings.padding} texels between them do not fit into"
+            f" {settings.resolution} x {settings.resolution} texels",
             where="lightmap.resolution",
             remedy="Raise lightmap.resolution, or give the scene a light-map UV with fewer charts.",
         )
-    return best, best_scale
+    scale, places = packed
+    meshes, notes, done = [], [], 0
+    for mesh, part, count in zip(scene.meshes, parts, counts, strict=True):
+        uv = np.zeros((len(part.vertex), 2))
+        for piece, place in zip(flat[done : done + count], places[done : done + count], strict=True):
+            uv[piece.vertices] = (piece.uv[:, ::-1] if place.turned else piece.uv) * scale + place.origin
+        done += count
+        meshes.append(_split(mesh, part, np.clip(uv / settings.resolution, 0.0, 1.0)))
+        default = "another mesh has to be" if reasons else "as asked"
+        why = f"its own light-map UV {reasons[mesh.name]}" if mesh.name in reasons else default
+        notes.append(f"Mesh '{mesh.name}': unwrapped into {count} chart{'s' if count > 1 else ''} ({why}).")
+    notes.append(f"Light map: a texel is {1.0 / scale:.3g} m wide.")
+    return replace(scene, meshes=tuple(meshes), notes=(*scene.notes, *notes))
 
 
-def _packed(meshes: Sequence[Mesh], settings: LightmapSettings, texels_per_metre: float) -> xatlas.Atlas:
-    atlas = xatlas.Atlas()
-    for mesh in meshes:
-        atlas.add_mesh(mesh.positions, mesh.faces.astype(np.uint32), mesh.normals)
-    options = xatlas.PackOptions()
-    options.resolution = settings.resolution
-    options.padding = settings.padding
-    options.texels_per_unit = texels_per_metre
-    options.bilinear = True
-    options.bruteForce = settings.resolution <= BRUTE_FORCE_TEXELS
-    options.create_image = False
-    atlas.generate(xatlas.ChartOptions(), options)
-    return atlas
+@dataclass(frozen=True)
+class _Piece:
+    """A chart with the vertices of the cut mesh that it holds."""
+
+    vertices: Ints
+    uv: Floats  # [len(vertices), 2] metres, lower bounds at 0, turned to the smallest bounding box
+    chart: Chart
 
 
-def _page_uv(uv: npt.NDArray[np.float32], atlas: xatlas.Atlas, resolution: int) -> npt.NDArray[np.float32]:
-    """xatlas divides by the page's own size, which may differ from the light map's."""
-    size = np.array([atlas.width, atlas.height], dtype=np.float64)
-    return np.clip(uv * size / resolution, 0.0, 1.0).astype(np.float32)
+def _flat_pieces(part: Unwrapped) -> list[_Piece]:
+    face_chart = part.chart[part.faces[:, 0]]
+    pieces = []
+    for number in range(int(part.chart.max()) + 1):
+        vertices = np.flatnonzero(part.chart == number)
+        uv = part.uv[vertices] @ bounding_turn(part.uv[vertices]).T
+        uv -= uv.min(axis=0)
+        local = np.searchsorted(vertices, part.faces[face_chart == number])
+        pieces.append(_Piece(vertices, uv, Chart(uv[local])))
+    return pieces
+
+
+def _split(mesh: Mesh, part: Unwrapped, lightmap_uv: Floats) -> Mesh:
+    return replace(
+        mesh,
+        positions=mesh.positions[part.vertex],
+        normals=mesh.normals[part.vertex],
+        faces=part.faces.astype(np.int32),
+        uv=None if mesh.uv is None else mesh.uv[part.vertex],
+        lightmap_uv=lightmap_uv.astype(np.float32),
+    )
 
 
 def _clipped(mesh: Mesh) -> npt.NDArray[np.float32]:

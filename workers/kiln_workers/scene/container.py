@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+
 from kiln_schemas.errors import InputError
 
 Array = npt.NDArray[Any]

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from kiln_schemas.errors import InputError
-from kiln_schemas.tasks import EnvironmentRef
 from scipy.sparse import csr_array
 
+from kiln_schemas.errors import InputError
+from kiln_schemas.tasks import EnvironmentRef
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.images import HDR_FORMATS, decode_image, image_format
 from kiln_workers.scene.model import Environment, Float32

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from kiln_schemas.errors import InputError, TooLarge
 
+from kiln_schemas.errors import InputError, TooLarge
 from kiln_workers.scene.model import Mesh
 
 Floats = npt.NDArray[np.float64]
@@ -144,7 +144,7 @@ def _transformed_normals(
     a, b, c = linear[:, 0], linear[:, 1], linear[:, 2]
     cofactor = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     sign = -1.0 if np.linalg.det(linear) < 0.0 else 1.0
-    bad = ~np.isfinite(normals).all(axis=1)
+    bad = np.asarray(~np.isfinite(normals).all(axis=1))
     world = np.where(bad[:, None], 0.0, normals) @ (sign * cofactor).T
     length = np.linalg.norm(world, axis=1, keepdims=True)
     bad |= length[:, 0] <= 1e-30

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from kiln_schemas.errors import InputError
 
+from kiln_schemas.errors import InputError
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.geometry import Floats, Ints, RawMesh, check_triangle_count, place, unique_names
 from kiln_workers.scene.gltf_buffers import GltfBuffers, split_glb

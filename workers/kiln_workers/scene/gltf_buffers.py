@@ -13,9 +13,10 @@ from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
-from kiln_schemas.errors import InputError
 
+from kiln_schemas.errors import InputError
 from kiln_workers.scene.bundle import BundleFolder
+from kiln_workers.scene.container import Array
 from kiln_workers.scene.gltf_document import Accessor, Document, pick
 
 COMPONENTS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -94,11 +95,10 @@ class GltfBuffers:
         """Accessor `index` as [count, width], normalised integers mapped to [0, 1] or [-1, 1]."""
         accessor, values = self._read(index, width, what)
         out = values.astype(np.float64)
-        if accessor.component_type == 5126:
+        if accessor.component_type == 5126 or not accessor.normalized:
             return out
-        if not accessor.normalized:
-            return out
-        return np.maximum(out / np.iinfo(values.dtype).max, -1.0)
+        largest = np.iinfo(np.dtype(DTYPES[accessor.component_type])).max
+        return np.asarray(np.maximum(out / largest, -1.0))
 
     def indices(self, index: int) -> npt.NDArray[np.int64]:
         """Accessor `index` as unsigned integers [count]."""
@@ -122,7 +122,7 @@ class GltfBuffers:
             self._loaded[index] = data[: buffer.byte_length]
         return self._loaded[index]
 
-    def _read(self, index: int, width: int, what: str) -> tuple[Accessor, npt.NDArray[np.generic]]:
+    def _read(self, index: int, width: int, what: str) -> tuple[Accessor, Array]:
         where = self.folder.origin
         accessor = pick(self.document.accessors, index, "accessor", where)
         label = f"accessor {index} ({what})"
@@ -141,7 +141,7 @@ class GltfBuffers:
             values = self._with_sparse(accessor, values, label)
         return accessor, values
 
-    def _with_sparse(self, accessor: Accessor, values: npt.NDArray[np.generic], label: str) -> npt.NDArray[np.generic]:
+    def _with_sparse(self, accessor: Accessor, values: Array, label: str) -> Array:
         assert accessor.sparse is not None
         where, sparse = self.folder.origin, accessor.sparse
         if sparse.count > accessor.count:
@@ -170,7 +170,7 @@ def _strided(
     dtype: np.dtype[np.generic],
     label: str,
     where: str,
-) -> npt.NDArray[np.generic]:
+) -> Array:
     size = width * dtype.itemsize
     step = size if stride is None else stride
     if step < size or offset + (count - 1) * step + size > len(data):

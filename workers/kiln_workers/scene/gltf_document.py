@@ -6,9 +6,10 @@ malformed field is refused with its path. Unknown fields are ignored, as the spe
 
 from typing import Annotated, Any, Literal, TypeVar
 
-from kiln_schemas.errors import InputError
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
+
+from kiln_schemas.errors import InputError
 
 Index = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Count = Annotated[int, Field(ge=1, le=2**31 - 1)]

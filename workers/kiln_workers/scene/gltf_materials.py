@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from kiln_schemas.errors import InputError
 
+from kiln_schemas.errors import InputError
 from kiln_workers.scene.gltf_buffers import GltfBuffers
 from kiln_workers.scene.gltf_document import (
     Document,

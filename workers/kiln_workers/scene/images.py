@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import OpenImageIO as oiio
+
 from kiln_schemas.errors import InputError, TooLarge
 
 MAX_SIDE: Final = 16384

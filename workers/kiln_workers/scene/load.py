@@ -10,7 +10,6 @@ from typing import Final
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.tasks import EnvironmentRef
-
 from kiln_workers.scene.environment import load_environment
 from kiln_workers.scene.gltf import read_gltf
 from kiln_workers.scene.mitsuba_xml import read_mitsuba_xml

@@ -1,7 +1,7 @@
 """One picture of a texel map for the report: validity, density and charts side by side.
 
-Validity: green is valid, red is inside geometry, dark is gutter. Density: metres a texel on a logarithmic scale from blue
-(fine) to yellow (coarse). Charts: one colour each.
+Validity: green is valid, red is inside geometry, dark is gutter. Density: metres a texel on a logarithmic scale from
+blue (fine) to yellow (coarse). Charts: one colour each.
 """
 
 from typing import Final
@@ -14,7 +14,9 @@ from kiln_workers.scene.texel_map import TexelMap, TexelState
 
 BACKGROUND: Final = (24, 26, 30)
 STATE_COLOURS: Final = {TexelState.VALID: (92, 174, 112), TexelState.INVALID: (222, 74, 62)}
-RAMP: Final = np.array([[38, 60, 160], [34, 130, 170], [70, 180, 120], [190, 205, 80], [252, 226, 70]], dtype=np.float64)
+RAMP: Final = np.array(
+    [[38, 60, 160], [34, 130, 170], [70, 180, 120], [190, 205, 80], [252, 226, 70]], dtype=np.float64
+)
 PANEL_PIXELS: Final = 256
 GAP_PIXELS: Final = 8
 
@@ -63,4 +65,4 @@ def _ramp(value: Floats) -> npt.NDArray[np.uint8]:
     place = np.clip(value, 0.0, 1.0) * (len(RAMP) - 1)
     low = np.minimum(place.astype(np.int64), len(RAMP) - 2)
     part = (place - low)[:, None]
-    return np.rint(RAMP[low] * (1.0 - part) + RAMP[low + 1] * part).astype(np.uint8)
+    return np.asarray(np.rint(RAMP[low] * (1.0 - part) + RAMP[low + 1] * part), dtype=np.uint8)

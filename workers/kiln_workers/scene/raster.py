@@ -1,7 +1,7 @@
 """Triangles on a grid of unit squares in numpy: which squares they touch, where they come closest, how they overlap.
 
-Works on spans: each triangle's bounding box is cut into its rows, and rows are expanded to squares in batches of bounded
-size, so memory stays small whatever the resolution. Coordinates are in squares: square (row, column) is
+Works on spans: each triangle's bounding box is cut into its rows, and rows are expanded to squares in batches of
+bounded size, so memory stays small whatever the resolution. Coordinates are in squares: square (row, column) is
 [column, column + 1] x [row, row + 1] of (x, y).
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from kiln_workers.scene.geometry import Floats, Ints
 
 BATCH_SQUARES: Final = 1 << 20
-TOUCH: Final = 1e-7
+TOUCH: Final = 1e-5
 """Squares by which a triangle must reach into a square to touch it: rounding of a shared border is no touch."""
 
 
@@ -29,7 +29,7 @@ class Touched:
 
 
 def touched_squares(corners: Floats, width: int, height: int) -> Touched:
-    """For every square that one of `corners` [F, 3, 2] touches: the triangle nearest to its centre, and its point there.
+    """For every square that a triangle of `corners` [F, 3, 2] touches: the nearest to its centre, and its point there.
 
     A triangle that contains the centre wins with distance 0; among equals the first triangle wins.
     """
@@ -60,7 +60,9 @@ def closest_point(corners: Floats, point: Floats) -> tuple[Floats, Floats]:
         j = (i + 1) % 3
         edge, to_point = corners[:, j] - corners[:, i], point - corners[:, i]
         length = (edge**2).sum(axis=1)
-        along = np.clip(np.divide((to_point * edge).sum(axis=1), length, out=np.zeros_like(length), where=length > 0), 0, 1)
+        along = np.clip(
+            np.divide((to_point * edge).sum(axis=1), length, out=np.zeros_like(length), where=length > 0), 0, 1
+        )
         gap = np.linalg.norm(to_point - along[:, None] * edge, axis=1)
         nearer = gap < distance
         distance[nearer] = gap[nearer]

@@ -6,8 +6,8 @@ that contains the centre wins, else the nearest. `alpha` is the material's rough
 0.002 (Filament's bound for perceptual roughness, 0.045, squared): narrower lobes are mirrors to every later stage.
 
 Terminator of smooth normals: paths start from the point that Hanika 2021 ("Hacking the Shadow Terminator", Ray Tracing
-Gems II, chapter 4) gives: the flat triangle's point is lifted to the interpolation of its projections on the vertices' tangent
-planes, where those lie above it. It follows the surface that the normals pretend, so facets do not shadow each other.
+Gems II, chapter 4) gives: the flat triangle's point is lifted to the interpolation of its projections on the vertices'
+tangent planes, where those lie above it. It follows the surface that the normals pretend, so facets do not shadow each other.
 Limited to half a texel; flat-shaded and concave faces are not moved.
 """
 
@@ -18,6 +18,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from kiln_schemas.errors import InputError
+from kiln_workers.render.backend import Device
+from kiln_workers.scene.container import Array
 from kiln_workers.scene.geometry import Floats, Ints, face_areas, face_normals
 from kiln_workers.scene.model import Image, Mesh, Scene, TextureRef
 from kiln_workers.scene.push_out import push_out
@@ -29,7 +31,7 @@ MIN_COSINE: Final = 0.05
 """A shading normal is bent towards the geometric one until their cosine is at least this."""
 
 
-def build_texel_map(scene: Scene, resolution: int, device: str = "auto") -> TexelMap:
+def build_texel_map(scene: Scene, resolution: int, device: Device = "auto") -> TexelMap:
     """The texel map of a scene whose meshes have light-map UVs, points pushed out of other geometry."""
     return push_out(scene, rasterise_texels(scene, resolution), device)
 
@@ -52,7 +54,7 @@ def rasterise_texels(scene: Scene, resolution: int) -> TexelMap:
     grid = (resolution, resolution)
     mesh = faces.mesh[touched.face]
 
-    def spread(values: Floats | Ints, dtype: type, empty: float = 0) -> np.ndarray[tuple[int, ...], np.dtype[np.generic]]:
+    def spread(values: Floats | Ints, dtype: type, empty: int = 0) -> Array:
         out = np.full((resolution * resolution, *values.shape[1:]), empty, dtype=dtype)
         out[touched.square] = values
         return out.reshape(*grid, *values.shape[1:])
@@ -70,7 +72,7 @@ def rasterise_texels(scene: Scene, resolution: int) -> TexelMap:
 
 
 def terminator_offset(position: Floats, weight: Floats, corners: Floats, normals: Floats) -> Floats:
-    """Hanika's offset [S, 3] of points with barycentrics `weight` [S, 3] in triangles [S, 3, 3] of unit normals [S, 3, 3].
+    """Hanika's offset [S, 3] of points with barycentrics `weight` [S, 3] in triangles [S, 3, 3] of unit `normals`.
 
     Hanika moves the point by sum_i w_i (t_i - min(0, t_i . n_i) n_i) with t_i = P - v_i; as sum_i w_i t_i = 0, that is
     - sum_i w_i min(0, t_i . n_i) n_i.
@@ -110,7 +112,7 @@ def sample_bilinear(image: Image, texture: TextureRef, uv: Floats, channel: int)
 
 def _wrapped(index: Ints, size: int, wrap: str) -> Ints:
     if wrap == "repeat":
-        return np.mod(index, size)
+        return np.asarray(np.mod(index, size))
     if wrap == "mirror":
         folded = np.mod(index, 2 * size)
         return np.minimum(folded, 2 * size - 1 - folded)
