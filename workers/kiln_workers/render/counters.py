@@ -9,7 +9,7 @@ split of the work into wavefronts gives the same bytes. The first two dimensions
 
 from typing import Any, Final
 
-import mitsuba as mi
+from kiln_workers.render.jit import mi
 
 GAMMA: Final = 0x9E3779B97F4A7C15
 _MIX_1: Final = 0xBF58476D1CE4E5B9

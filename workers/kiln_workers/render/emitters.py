@@ -7,8 +7,7 @@ textures repeat and overlap. This one samples the surface uniformly and looks th
 from functools import lru_cache
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
+from kiln_workers.render.jit import dr, mi
 
 
 def register_emitters() -> None:

@@ -7,13 +7,12 @@ products are sums over an octahedral grid of the environment's energy, finer for
 from dataclasses import dataclass
 from typing import Final
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
 from kiln_workers.render import lobes
 from kiln_workers.render.backend import Device, select_variant
+from kiln_workers.render.jit import dr, mi
 from kiln_workers.scene.model import Environment, Float32
 from kiln_workers.sphere import octahedral
 
@@ -151,7 +150,7 @@ def _cube_mirror(environment: Environment, side: int) -> Float32:
         for column in range(density):
             offset = ((column + 0.5) / density, (row + 0.5) / density)
             total += look_up(environment, cube_directions(side, offset))
-    return (total / density**2).astype(np.float32)
+    return np.asarray(total / density**2, dtype=np.float32)
 
 
 def _filtered(environment: Environment, targets: Floats, alpha: float, cosine: bool) -> Floats:

@@ -10,10 +10,10 @@ table of kernels and takes every texel's own alpha.
 
 from typing import Any, Final
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
+
+from kiln_workers.render.jit import dr, mi
 
 Floats = npt.NDArray[np.float64]
 

@@ -9,13 +9,12 @@ back. Spot lights fall off linearly in the angle between their cones, which glTF
 
 from typing import Any, Final
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from kiln_workers.render import textures
 from kiln_workers.render.backend import select_variant
 from kiln_workers.render.emitters import register_emitters
+from kiln_workers.render.jit import dr, mi
 from kiln_workers.scene.model import Environment, Float32, LightKind, Material, Mesh, PunctualLight, Scene
 
 MIN_ROUGHNESS: Final = 0.05
@@ -229,8 +228,8 @@ def _emission(scene: Scene, material: Material, mesh: Mesh, weight: float) -> An
 def _light(light: PunctualLight, weight: float) -> dict[str, Any]:
     intensity = {"type": "rgb", "value": list(light.intensity)}
     if light.kind is LightKind.DIRECTIONAL:
-        direction = list(light.direction)
-        return {"type": "directional", "direction": direction, "irradiance": intensity, "sampling_weight": weight}
+        travel = list(light.direction)
+        return {"type": "directional", "direction": travel, "irradiance": intensity, "sampling_weight": weight}
     if light.kind is LightKind.POINT:
         return {"type": "point", "position": list(light.position), "intensity": intensity, "sampling_weight": weight}
     origin, direction = np.asarray(light.position, np.float64), np.asarray(light.direction, np.float64)

@@ -12,11 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from kiln_workers.render import counters
+from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.mitsuba_scene import mesh_number, scene_bounds, scene_diagonal, to_mitsuba
 from kiln_workers.scene.model import Scene
 

@@ -9,11 +9,11 @@ KHR_texture_transform scales, then rotates counter-clockwise as seen on the imag
 import math
 from typing import Any, Final
 
-import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
-from kiln_schemas.errors import TooLarge
 
+from kiln_schemas.errors import TooLarge
+from kiln_workers.render.jit import mi
 from kiln_workers.scene.model import Float32, Image, TextureRef
 
 Floats = npt.NDArray[np.float64]

@@ -10,16 +10,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
+
 from kiln_schemas.conventions import FP16_MAX
 from kiln_schemas.errors import MachineLacks
 from kiln_schemas.settings import RenderSettings
-
 from kiln_workers.render import counters
 from kiln_workers.render.backend import Device, select_variant
+from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.paths import TEXEL_OFFSET, LaneSums, PathTracer, Start
 from kiln_workers.render.visibility import RayTable, texel_hash, trace_visibility, weighted_visibility
 from kiln_workers.scene.model import Float32, Scene
@@ -132,7 +131,7 @@ class TileRenderer:
             return Start(points.origin, direction, jacobian * density, 0.0, dr.dot(direction, points.normal) > 0.0)
 
         count = dr.full(mi.UInt32, samples, len(texel))
-        sums = self.tracer.trace(lanes, count, start, False)
+        sums: LaneSums = self.tracer.trace(lanes, count, start, False)
         dr.eval(sums.radiance, sums.weight, sums.back_faces, sums.dropped)
         return sums
 

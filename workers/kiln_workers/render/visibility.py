@@ -13,13 +13,12 @@ is assumed.
 from dataclasses import dataclass
 from typing import Any, Final
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
 from kiln_workers.render import counters, lobes
 from kiln_workers.render.environment import environment_samples, octahedral_energy, pixel_of
+from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.paths import PathTracer
 from kiln_workers.scene.model import Environment, Float32
 from kiln_workers.sphere import octahedral
