@@ -11,9 +11,9 @@ from collections.abc import AsyncIterator
 from fastapi import Depends, FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import JSONResponse
+
 from kiln_schemas import __version__
 from kiln_schemas.errors import InputError
-
 from kiln_service import problems
 from kiln_service.api import blobs as blob_routes
 from kiln_service.api import health as health_routes
@@ -75,7 +75,7 @@ async def _lifespan(app: FastAPI, config: ServiceConfig) -> AsyncIterator[None]:
     """Connect, migrate, run the background work; undo it all at the end."""
     if config.database is None:
         raise InputError("no database is configured", where="database", remedy="Start it with `lightkiln serve`.")
-    async with Database(config.database, config.pool_size) as database:
+    async with Database(config.database, config.pool_size, config.timing.database_s) as database:
         await migrate(database)
         signals = Signals(database)
         blobs = Blobs(database, config.blob_base, config.incoming, config.limits)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Final
 
 from kiln_schemas.errors import AuthError, Forbidden
-
 from kiln_service.config import Scope, TokenEntry
 
 TOKEN_FILE: Final = "token"

@@ -20,10 +20,10 @@ from urllib.parse import unquote, urlparse
 
 import obstore
 import psycopg
-from kiln_schemas.errors import InputError, MachineLacks, NotFound, TooLarge, Truncated
 from obstore.exceptions import BaseError
 from obstore.store import ObjectStore, from_url
 
+from kiln_schemas.errors import InputError, MachineLacks, NotFound, TooLarge, Truncated
 from kiln_service.config import Limits
 from kiln_service.db import Database, Tx
 

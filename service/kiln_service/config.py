@@ -8,10 +8,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from pydantic import Field, ValidationError
+
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import InputError
 from kiln_schemas.tasks import Sha256
-from pydantic import Field, ValidationError
 
 
 class Scope(StrEnum):
@@ -59,6 +60,8 @@ class Timing(Contract):
     """A running task without a heartbeat for this long has lost its worker."""
     poll_s: float = Field(default=1.0, gt=0)
     """Longest sleep of a waiting claim or event stream (a retried job sends no NOTIFY)."""
+    database_s: float = Field(default=15.0, gt=0)
+    """A request waits so long for a database connection before it is answered 503."""
     maintenance_s: float = Field(default=5.0, gt=0)
     """Between two passes of the reaper and the reconciler."""
     blob_grace_s: float = Field(default=3600.0, gt=0)

@@ -28,6 +28,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 import psycopg
+
 from kiln_schemas.errors import MachineLacks
 
 log = logging.getLogger(__name__)

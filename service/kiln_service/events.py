@@ -13,12 +13,12 @@ from typing import Any, Final
 
 import psycopg
 import psycopg.sql
-from kiln_schemas.errors import NotFound
-from kiln_schemas.job import EventView
-from kiln_schemas.states import FINAL_JOB_STATES, JobState
 from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
+from kiln_schemas.errors import NotFound
+from kiln_schemas.job import EventView
+from kiln_schemas.states import FINAL_JOB_STATES, JobState
 from kiln_service.db import Database, Tx
 
 log = logging.getLogger(__name__)

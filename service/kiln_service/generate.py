@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from pydantic import BaseModel
+
 from kiln_schemas.errors import Problem
 from kiln_schemas.job import EventView, JobRequest, JobView, TaskView
 from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.tasks import Claim, Commit, Failure, Heartbeat, WorkerRegistration
-from pydantic import BaseModel
-
 from kiln_service.app import create_app, openapi_document
 from kiln_service.config import ServiceConfig
 

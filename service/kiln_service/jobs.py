@@ -6,7 +6,6 @@ from kiln_schemas.errors import Conflict, InputError, NotFound
 from kiln_schemas.job import JobRequest, check_bundle
 from kiln_schemas.settings import BakeSettings, make_settings
 from kiln_schemas.states import FINAL_JOB_STATES, JobState
-
 from kiln_service import queue, transitions
 from kiln_service.blobs import require_blobs, use_blobs
 from kiln_service.config import ServiceConfig

@@ -16,7 +16,6 @@ from kiln_schemas.tasks import (
     RenderResult,
     TaskKind,
 )
-
 from kiln_service.db import JobRow, TaskRow, Tx
 
 

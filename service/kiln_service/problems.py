@@ -10,12 +10,12 @@ import psycopg
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, NotFound, Problem, TooLarge, Unreachable
 from psycopg_pool import PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, NotFound, Problem, TooLarge, Unreachable
 from kiln_service.auth import TokenBook
 from kiln_service.config import Limits
 from kiln_service.ids import new_id

@@ -13,13 +13,13 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 import psycopg
-from kiln_schemas.errors import InternalError
-from kiln_schemas.tasks import TaskKind
 from procrastinate import PsycopgConnector
 from procrastinate.exceptions import NoResult
 from procrastinate.jobs import Job, Status
 from procrastinate.manager import JobManager
 
+from kiln_schemas.errors import InternalError
+from kiln_schemas.tasks import TaskKind
 from kiln_service.db import Tx
 from kiln_service.planner import PRIORITY
 

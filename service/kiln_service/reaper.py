@@ -10,7 +10,6 @@ from typing import Final
 
 from kiln_schemas.errors import BakeFailed, Problem
 from kiln_schemas.states import TaskState
-
 from kiln_service import transitions
 from kiln_service.db import Database, TaskRow, Tx
 from kiln_service.jobs import withdraw

@@ -8,7 +8,6 @@ queue job that waits for a task which is not queued is deleted.
 import logging
 
 from kiln_schemas.states import TaskState
-
 from kiln_service import queue
 from kiln_service.db import Database
 from kiln_service.work import lock_task

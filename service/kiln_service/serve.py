@@ -22,8 +22,8 @@ from typing import Any, Final
 
 import uvicorn
 from fastapi import FastAPI
-from kiln_schemas.errors import Conflict, InputError, KilnError, MachineLacks
 
+from kiln_schemas.errors import Conflict, InputError, KilnError, MachineLacks
 from kiln_service.app import create_app
 from kiln_service.auth import TOKEN_FILE
 from kiln_service.config import ServiceConfig, make_config

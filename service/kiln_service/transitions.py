@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
+from psycopg.types.json import Jsonb
+
 from kiln_schemas.errors import IllegalTransition, Problem
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState, check_job_move, check_task_move
 from kiln_schemas.tasks import Bundle, Result
-from psycopg.types.json import Jsonb
-
 from kiln_service import queue
 from kiln_service.blobs import drop_blobs
 from kiln_service.db import JobRow, TaskRow, Tx, WorkerRow
@@ -76,6 +76,8 @@ async def add_tasks(tx: Tx, job: JobRow, planned: Sequence[Planned]) -> None:
 
 async def release_task(tx: Tx, task: TaskRow) -> None:
     """waiting > queued."""
+    if task.state is not TaskState.WAITING:
+        raise IllegalTransition(f"a task that is {task.state} cannot be released")
     check_task_move(task.state, TaskState.QUEUED)
     await _move(tx, "move_task_queued", task)
     await queue.defer(tx, [(task.id, task.kind)])

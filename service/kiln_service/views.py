@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from typing import Final
 
+from psycopg.rows import DictRow
+
 from kiln_schemas.errors import InputError, NotFound
 from kiln_schemas.job import JobPage, JobView, StageView, TaskView
 from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
-from psycopg.rows import DictRow
-
 from kiln_service.db import Database, JobRow, TaskRow, Tx
 from kiln_service.planner import METHODS
 

@@ -10,6 +10,8 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
+from psycopg.types.json import Jsonb
+
 from kiln_schemas.errors import Conflict, InputError, KilnError, NotFound, Problem, StaleAttempt
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import (
@@ -28,8 +30,6 @@ from kiln_schemas.tasks import (
     TaskKind,
     WorkerRegistration,
 )
-from psycopg.types.json import Jsonb
-
 from kiln_service import queue, transitions
 from kiln_service.blobs import drop_blobs, require_blobs, use_blobs
 from kiln_service.config import ServiceConfig

@@ -15,13 +15,14 @@ import httpx
 import psycopg
 import pytest
 import uvicorn
+from psycopg.rows import dict_row
+
 from kiln_service.app import create_app
 from kiln_service.config import Limits, ServiceConfig, Timing
 from kiln_service.embedded import EmbeddedPostgres
-from psycopg.rows import dict_row
 
 FAST = Timing(heartbeat_s=0.2, stale_s=0.8, poll_s=0.1, maintenance_s=0.1)
-SLOW_REAPER = Timing(heartbeat_s=0.2, stale_s=600, poll_s=0.1, maintenance_s=0.1)
+SLOW_REAPER = Timing(heartbeat_s=0.2, stale_s=600, poll_s=0.1, maintenance_s=0.3)
 
 
 @pytest.fixture(scope="session")
@@ -40,7 +41,12 @@ def folder() -> Iterator[Path]:
 
 @pytest.fixture
 def dsn(postgres: EmbeddedPostgres, request: pytest.FixtureRequest) -> Iterator[str]:
-    name = "t" + hashlib.sha256(request.node.nodeid.encode()).hexdigest()[:16]
+    with new_database(postgres, "t" + hashlib.sha256(request.node.nodeid.encode()).hexdigest()[:16]) as dsn:
+        yield dsn
+
+
+@contextmanager
+def new_database(postgres: EmbeddedPostgres, name: str) -> Iterator[str]:
     with psycopg.connect(postgres.dsn, autocommit=True) as connection:
         connection.execute(f"CREATE DATABASE {name}")
         yield postgres.dsn.replace("dbname=postgres", f"dbname={name}")
@@ -242,6 +248,17 @@ def start(dsn: str, tmp_path: Path) -> Starter:
 @pytest.fixture
 def home(start: Starter) -> Iterator[Coordinator]:
     with start() as coordinator:
+        yield coordinator
+
+
+@pytest.fixture(scope="session")
+def shared(postgres: EmbeddedPostgres) -> Iterator[Coordinator]:
+    """One coordinator for all tests that leave nothing behind which another would notice."""
+    with (
+        new_database(postgres, "shared") as dsn,
+        TemporaryDirectory(prefix="kiln-test-") as folder,
+        serving(Starter(Path(folder), dsn).config()) as coordinator,
+    ):
         yield coordinator
 
 

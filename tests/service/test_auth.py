@@ -6,6 +6,7 @@ import stat
 
 import httpx
 import pytest
+
 from kiln_service.auth import own_token
 from kiln_service.config import Scope, TokenEntry
 
@@ -13,20 +14,20 @@ OPEN = {"/healthz", "/readyz"}
 PLACEHOLDERS = {"sha256": "0" * 64}
 
 
-def routes(home):
+def routes(shared):
     """Every method and path of the interface, with something in place of its parameters."""
-    document = home.client.get("/v1/openapi.json").json()
+    document = shared.client.get("/v1/openapi.json").json()
     for path, operations in document["paths"].items():
         filled = re.sub(r"{(\w+)}", lambda match: PLACEHOLDERS.get(match[1], "x"), path)
         yield from ((method.upper(), filled) for method in operations)
 
 
 @pytest.mark.parametrize("header", [None, "Bearer wrong", "Basic dXNlcjpwdw==", "Bearer", "Bearer \xff\xfe"])
-def test_every_route_refuses_without_a_valid_token(home, header):
+def test_every_route_refuses_without_a_valid_token(shared, header):
     headers = {} if header is None else {"Authorization": header.encode("latin-1")}
-    found = list(routes(home))
+    found = list(routes(shared))
     assert len(found) > 15
-    with httpx.Client(base_url=home.url, headers=headers) as stranger:
+    with httpx.Client(base_url=shared.url, headers=headers) as stranger:
         for method, path in found:
             reply = stranger.request(method, path)
             if path in OPEN:
@@ -39,9 +40,9 @@ def test_every_route_refuses_without_a_valid_token(home, header):
                 assert reply.json()["code"] == "unauthorized" and reply.json()["remedy"]
 
 
-def test_a_token_that_differs_in_its_last_letter_is_refused(home):
-    for token in (home.token[:-1], home.token + "x", home.token[:-1] + ("a" if home.token[-1] != "a" else "b")):
-        reply = httpx.get(f"{home.url}/v1/jobs", headers={"Authorization": f"Bearer {token}"})
+def test_a_token_that_differs_in_its_last_letter_is_refused(shared):
+    for token in (shared.token[:-1], shared.token + "x", shared.token[:-1] + ("a" if shared.token[-1] != "a" else "b")):
+        reply = httpx.get(f"{shared.url}/v1/jobs", headers={"Authorization": f"Bearer {token}"})
         assert reply.status_code == 401
 
 

@@ -1,5 +1,8 @@
 """A job from its submission to its artifacts, and what clients see of it on the way."""
 
+import threading
+import time
+
 
 def test_a_job_runs_through_all_stages(home):
     job = home.submit()
@@ -73,9 +76,6 @@ def test_kinds_are_respected_and_waiting_claims_are_woken(home):
 
 
 def test_a_waiting_claim_gets_the_task_that_comes(home):
-    import threading
-    import time
-
     worker, got = home.worker(), []
     thread = threading.Thread(target=lambda: got.append((worker.claim(wait_s=20), time.monotonic())))
     thread.start()

@@ -1,7 +1,12 @@
 """Bad input: each gets its code, a sentence and no trace of a job."""
 
+import time
+
+import psycopg
 import pytest
-from kiln_service.config import Limits
+
+from kiln_schemas.settings import PRESETS
+from kiln_service.config import Limits, Timing
 
 
 @pytest.mark.parametrize(
@@ -18,25 +23,22 @@ from kiln_service.config import Limits
         ({"preset": "draft", "settings": "draft"}, 422, "settings", "both"),
     ],
 )
-def test_settings_that_are_wrong(home, changes, status, where, word):
-    from kiln_schemas.settings import PRESETS
-
+def test_settings_that_are_wrong(shared, changes, status, where, word):
     if changes.get("settings"):
         changes = changes | {"settings": PRESETS["draft"].model_dump(mode="json")}
-    reply = home.client.post("/v1/jobs", json=home.request(**changes))
+    before = shared.sql("SELECT count(*) AS jobs FROM jobs")
+    reply = shared.client.post("/v1/jobs", json=shared.request(**changes))
     problem = reply.json()
     assert (reply.status_code, problem["where"]) == (status, where), problem
     assert word in problem["detail"] and reply.headers["content-type"] == "application/problem+json"
-    assert home.client.get("/v1/jobs").json()["jobs"] == []
+    assert shared.sql("SELECT count(*) AS jobs FROM jobs") == before
 
 
 @pytest.mark.parametrize("resolution", [0, 100_000])
-def test_complete_settings_with_an_impossible_light_map(home, resolution):
-    from kiln_schemas.settings import PRESETS
-
+def test_complete_settings_with_an_impossible_light_map(shared, resolution):
     settings = PRESETS["draft"].model_dump(mode="json")
     settings["lightmap"]["resolution"] = resolution
-    reply = home.client.post("/v1/jobs", json=home.request(preset=None, settings=settings))
+    reply = shared.client.post("/v1/jobs", json=shared.request(preset=None, settings=settings))
     problem = reply.json()
     assert reply.status_code == 422 and problem["where"] == "settings.lightmap.resolution"
     assert str(resolution) in problem["detail"]
@@ -45,38 +47,39 @@ def test_complete_settings_with_an_impossible_light_map(home, resolution):
 @pytest.mark.parametrize(
     "path", ["../scene.glb", "/etc/passwd", "a/../../b", "a//b", "./a", "C:/a", "a\\b", "a\0b", "..", "a/.."]
 )
-def test_paths_that_leave_the_bundle(home, path):
-    sha256 = home.upload(b"a scene")
+def test_paths_that_leave_the_bundle(shared, path):
+    sha256 = shared.upload(b"a scene")
+    before = shared.sql("SELECT count(*) AS jobs FROM jobs")
     for bundle in (
         {"entry": path, "files": {path: sha256}},
         {"entry": "scene.glb", "files": {"scene.glb": sha256, path: sha256}},
     ):
-        reply = home.client.post("/v1/jobs", json=home.request(bundle=bundle))
+        reply = shared.client.post("/v1/jobs", json=shared.request(bundle=bundle))
         assert reply.status_code == 422 and reply.json()["code"] == "input", reply.text
         assert reply.json()["where"] == "bundle.files"
-    assert home.client.get("/v1/jobs").json()["jobs"] == []
+    assert shared.sql("SELECT count(*) AS jobs FROM jobs") == before
 
 
-def test_entry_and_environment_must_be_in_the_bundle(home):
-    files = {"scene.glb": home.upload(b"a scene")}
+def test_entry_and_environment_must_be_in_the_bundle(shared):
+    files = {"scene.glb": shared.upload(b"a scene")}
     for bundle, where in (
         ({"entry": "other.glb", "files": files}, "bundle.entry"),
         ({"entry": "scene.glb", "files": files, "environment": {"file": "sky.exr"}}, "bundle.environment.file"),
     ):
-        reply = home.client.post("/v1/jobs", json=home.request(bundle=bundle))
+        reply = shared.client.post("/v1/jobs", json=shared.request(bundle=bundle))
         assert reply.status_code == 422 and reply.json()["where"] == where
 
 
-def test_files_that_were_not_uploaded_are_named(home):
-    bundle = {"entry": "scene.glb", "files": {"scene.glb": home.upload(b"a scene"), "wood.png": "d" * 64}}
-    reply = home.client.post("/v1/jobs", json=home.request(bundle=bundle))
+def test_files_that_were_not_uploaded_are_named(shared):
+    bundle = {"entry": "scene.glb", "files": {"scene.glb": shared.upload(b"a scene"), "wood.png": "d" * 64}}
+    reply = shared.client.post("/v1/jobs", json=shared.request(bundle=bundle))
     assert reply.status_code == 409 and reply.json()["where"] == "bundle.files"
     assert "wood.png" in reply.json()["detail"] and "scene.glb" not in reply.json()["detail"]
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b"[]", b'"text"', b"\xff\xfe", b'{"name": NaN}'])
-def test_bodies_that_are_no_request(home, body):
-    reply = home.client.post("/v1/jobs", content=body, headers={"Content-Type": "application/json"})
+def test_bodies_that_are_no_request(shared, body):
+    reply = shared.client.post("/v1/jobs", content=body, headers={"Content-Type": "application/json"})
     assert reply.status_code == 422 and reply.headers["content-type"] == "application/problem+json"
 
 
@@ -86,7 +89,7 @@ def test_a_body_over_the_bound(start):
         assert reply.status_code == 413 and reply.json()["code"] == "too-large"
 
 
-def test_no_such_route_method_job_or_cursor(home):
+def test_no_such_route_method_job_or_cursor(shared):
     for method, path, status, code in (
         ("GET", "/v1/nothing", 404, "not-found"),
         ("DELETE", "/v1/jobs", 405, "method-not-allowed"),
@@ -99,7 +102,7 @@ def test_no_such_route_method_job_or_cursor(home):
         ("GET", "/v1/jobs?state=busy", 422, "input"),
         ("GET", "/v1/jobs?limit=0", 422, "input"),
     ):
-        reply = home.client.request(method, path)
+        reply = shared.client.request(method, path)
         assert (reply.status_code, reply.json()["code"]) == (status, code), path
 
 
@@ -113,8 +116,21 @@ def test_a_defect_gives_an_id_that_is_in_the_log_and_no_traceback(home, caplog):
     assert any(defect in record.message and record.exc_info for record in caplog.records)
 
 
-def test_a_database_that_is_away_is_503(home):
-    home.sql("ALTER TABLE jobs RENAME TO hidden")
-    assert home.client.get("/v1/jobs").status_code == 500
-    home.sql("ALTER TABLE hidden RENAME TO jobs")
-    assert home.client.get("/readyz").json() == {"database": "ok", "storage": "ok"}
+def test_a_database_that_is_away_is_503(start, postgres):
+    with start(timing=Timing(database_s=0.5, maintenance_s=0.3)) as home:
+        home.submit()
+        name = home.sql("SELECT current_database() AS name")[0]["name"]
+        with psycopg.connect(postgres.dsn, autocommit=True) as admin:
+            admin.execute(f"ALTER DATABASE {name} WITH ALLOW_CONNECTIONS false")
+            admin.execute("SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = %s", [name])
+            for path in ("/v1/jobs", "/readyz"):
+                reply = home.client.get(path)
+                assert reply.status_code == 503 and reply.json()["code"] == "unreachable", path
+            assert home.client.get("/healthz").status_code == 200
+            admin.execute(f"ALTER DATABASE {name} WITH ALLOW_CONNECTIONS true")
+        deadline = time.monotonic() + 20
+        while home.client.get("/readyz").status_code != 200:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        assert len(home.client.get("/v1/jobs").json()["jobs"]) == 1
+        assert home.worker().must_claim()["payload"]["kind"] == "prepare"

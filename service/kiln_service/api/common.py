@@ -6,8 +6,8 @@ from typing import Annotated, Any, Final
 
 from fastapi import Depends, Path, Request, Security
 from fastapi.security import HTTPBearer
-from kiln_schemas.errors import Problem
 
+from kiln_schemas.errors import Problem
 from kiln_service.auth import Principal
 from kiln_service.blobs import Blobs
 from kiln_service.config import Scope, ServiceConfig

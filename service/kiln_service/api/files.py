@@ -5,8 +5,8 @@ from typing import Final
 
 from fastapi import Request
 from fastapi.responses import Response, StreamingResponse
-from kiln_schemas.errors import InputError
 
+from kiln_schemas.errors import InputError
 from kiln_service.blobs import Blobs
 from kiln_service.problems import problem_response
 

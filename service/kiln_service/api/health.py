@@ -1,8 +1,8 @@
 """Routes for supervisors: does the process live, can it work. They need no token and tell nothing else."""
 
 from fastapi import APIRouter, Response
-from kiln_schemas.errors import KilnError, Unreachable
 
+from kiln_schemas.errors import KilnError, Unreachable
 from kiln_service.api.common import PartsHere
 from kiln_service.problems import problem_response
 

@@ -4,11 +4,11 @@ from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
+
 from kiln_schemas.errors import InputError
 from kiln_schemas.job import EventView, JobPage, JobRequest, JobView, TaskView
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
-
 from kiln_service import jobs, views
 from kiln_service.api.common import PartsHere, caller, problems
 from kiln_service.api.files import serve_blob

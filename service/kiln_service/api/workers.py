@@ -1,6 +1,7 @@
 """Routes for workers: register, claim, heartbeat, and the end of a task."""
 
 from fastapi import APIRouter, Depends, Response
+
 from kiln_schemas.tasks import (
     Checkpoint,
     Claim,
@@ -12,7 +13,6 @@ from kiln_schemas.tasks import (
     WorkerRegistration,
     WorkerWelcome,
 )
-
 from kiln_service.api.common import PartsHere, caller, problems
 from kiln_service.config import Scope
 

@@ -10,10 +10,10 @@ from contextlib import asynccontextmanager
 from typing import Any, Self
 
 import psycopg
-from kiln_schemas.errors import InternalError
 from psycopg.rows import DictRow, dict_row
 from psycopg_pool import AsyncConnectionPool
 
+from kiln_schemas.errors import InternalError
 from kiln_service.db.queries import all_queries
 
 
@@ -49,13 +49,13 @@ class Tx:
 class Database:
     """A pool of connections to one PostgreSQL database."""
 
-    def __init__(self, dsn: str, size: int = 10) -> None:
+    def __init__(self, dsn: str, size: int = 10, patience_s: float = 15.0) -> None:
         self.dsn = dsn
         self._pool: AsyncConnectionPool[psycopg.AsyncConnection[DictRow]] = AsyncConnectionPool(
             dsn,
             min_size=2,
             max_size=size,
-            timeout=15.0,
+            timeout=patience_s,
             open=False,
             kwargs={"row_factory": dict_row},
             check=AsyncConnectionPool.check_connection,
@@ -63,7 +63,7 @@ class Database:
         )
 
     async def __aenter__(self) -> Self:
-        await self._pool.open(wait=True)
+        await self._pool.open(wait=True, timeout=30.0)
         return self
 
     async def __aexit__(self, *_: object) -> None:

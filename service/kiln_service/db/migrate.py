@@ -8,9 +8,9 @@ import hashlib
 from importlib import resources
 from typing import Final
 
-from kiln_schemas.errors import Conflict
 from procrastinate.schema import SchemaManager
 
+from kiln_schemas.errors import Conflict
 from kiln_service.db.database import Database, Tx
 
 MIGRATION_LOCK: Final = 0x6B696C6E_0001

@@ -4,11 +4,12 @@ from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any, Self
 
+from psycopg.rows import DictRow
+
 from kiln_schemas.errors import Problem
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Bundle, Progress, TaskKind
-from psycopg.rows import DictRow
 
 
 class _Row:

@@ -1,0 +1,100 @@
+"""Planning and estimating, without a database."""
+
+import time
+
+import pytest
+
+from kiln_schemas.errors import InputError, TooLarge
+from kiln_schemas.settings import PRESETS
+from kiln_schemas.tasks import PrepareResult, TaskKind, Tile
+from kiln_service.ids import new_id
+from kiln_service.planner import SG_LIGHTFIELD, plan_after_prepare, plan_job
+from kiln_service.views import remaining_seconds
+
+
+def prepared(tiles, **changes):
+    about = {"scene": "0" * 64, "texel_map": "1" * 64, "scene_hash": "2" * 64, "triangles": 1, "seconds": 1.0}
+    about |= {"has_environment": True, "has_light": True}
+    return PrepareResult(tiles=tuple(tiles), **about | changes)
+
+
+def tile(row, column, texels=3):
+    return Tile(row=row, column=column, size=8, texels=texels)
+
+
+def plan(result, most=100):
+    return plan_after_prepare(result, PRESETS["draft"], most)
+
+
+def test_the_plan():
+    assert [(task.kind, task.ready) for task in plan_job()] == [(TaskKind.PREPARE, True)]
+    planned = plan(prepared([tile(8, 0), tile(0, 8), tile(0, 0)]))
+    assert [task.label for task in planned] == [
+        "tile 0,0",
+        "tile 0,8",
+        "tile 8,0",
+        "light_field",
+        "visibility",
+        "package",
+    ]
+    assert [task.ready for task in planned] == [True, True, True, False, False, False]
+    assert planned[1].spec == {"tile": {"row": 0, "column": 8, "size": 8, "texels": 3}}
+
+
+def test_stages_follow_each_other():
+    order, kind = [], TaskKind.PREPARE
+    while kind is not None:
+        order.append(kind)
+        kind = SG_LIGHTFIELD.stage_after(kind)
+    assert order == [TaskKind.PREPARE, TaskKind.RENDER, TaskKind.FIT, TaskKind.PACKAGE]
+
+
+@pytest.mark.parametrize(
+    ("result", "word"),
+    [
+        (prepared([]), "no texel"),
+        (prepared([tile(0, 0)], has_light=False), "no light"),
+        (prepared([tile(0, 0), tile(0, 0)]), "overlap"),
+        (prepared([tile(0, 32)]), "leave"),
+        (prepared([tile(0, 0, texels=0)]), "empty"),
+    ],
+)
+def test_what_cannot_be_baked(result, word):
+    with pytest.raises(InputError, match=word):
+        plan(result)
+
+
+def test_too_many_tiles():
+    with pytest.raises(TooLarge, match="more than 1"):
+        plan(prepared([tile(0, 0), tile(0, 8)]), most=1)
+
+
+def stage(total, completed=0, seconds=0.0, running=()):
+    fractions, elapsed = [list(part) for part in zip(*running, strict=True)] if running else [None, None]
+    return {"total": total, "completed": completed, "seconds": seconds, "fractions": fractions, "elapsed": elapsed}
+
+
+@pytest.mark.parametrize(
+    ("rows", "seconds"),
+    [
+        ([], None),
+        ([stage(4)], None),
+        ([stage(4, running=[(0.01, 3.0)])], None),
+        ([stage(1, running=[(0.25, 10.0)])], 30.0),
+        ([stage(4, completed=2, seconds=20.0)], 20.0),
+        ([stage(4, completed=2, seconds=20.0, running=[(0.5, 5.0), (0.5, 5.0)])], 5.0),
+        ([stage(10, completed=2, seconds=20.0, running=[(0.0, 0.0), (0.0, 0.0)])], 40.0),
+        ([stage(1, completed=1, seconds=20.0), stage(2, completed=1, seconds=6.0), stage(1)], 6.0),
+        ([stage(1, completed=1, seconds=20.0)], None),
+    ],
+)
+def test_remaining_seconds(rows, seconds):
+    assert remaining_seconds(rows) == seconds
+
+
+def test_ids_sort_by_time_and_are_version_7():
+    first = new_id()
+    time.sleep(0.002)
+    second = new_id()
+    assert first < second and len(first) == 32 and first[12] == "7" and first[16] in "89ab"
+    assert len({new_id() for _ in range(1000)}) == 1000

@@ -1,0 +1,177 @@
+"""The real process: killed, restarted, stopped, started twice."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from kiln_service.embedded import EmbeddedPostgres
+
+
+class Process:
+    """`python -m kiln_service` with an embedded database."""
+
+    def __init__(self, data, port=0):
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "kiln_service", "--data", str(data), "--port", str(port), "--json"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        line = self.process.stdout.readline()
+        assert line, self.process.stderr.read()
+        self.ready = json.loads(line)
+        self.url = self.ready["url"]
+        token = Path(self.ready["token_file"]).read_text().strip()
+        self.client = httpx.Client(base_url=self.url, headers={"Authorization": f"Bearer {token}"}, timeout=30)
+
+    def stop(self, number):
+        """Send a signal; the exit code and what was written to standard error."""
+        self.client.close()
+        self.process.send_signal(number)
+        _, errors = self.process.communicate(timeout=60)
+        return self.process.returncode, errors
+
+
+@contextmanager
+def coordinator(data, port=0):
+    running = Process(data, port)
+    try:
+        yield running
+    finally:
+        if running.process.poll() is None:
+            running.stop(signal.SIGKILL)
+
+
+def servers_of(folder):
+    """Pids of PostgreSQL servers of a data folder."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                words = (entry / "cmdline").read_bytes().split(b"\0")
+            except (FileNotFoundError, ProcessLookupError):
+                continue
+            if words[0].endswith(b"/postgres") and os.fsencode(folder / "postgres") in words:
+                found.append(int(entry.name))
+    return found
+
+
+def test_kill_and_restart(folder):
+    """kill -9 in the middle of a job: the same worker goes on with the same attempt."""
+    worker = {"name": "w", "kinds": ["prepare"], "memory_bytes": 1, "threads": 1, "device": "none", "version": "0"}
+    with coordinator(folder) as first:
+        sha256 = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
+        first.client.put(f"/v1/blobs/{sha256}", content=b"test").raise_for_status()
+        bundle = {"entry": "a.glb", "files": {"a.glb": sha256}}
+        request = {"name": "n", "preset": "draft", "bundle": bundle}
+        job = first.client.post("/v1/jobs", json=request).raise_for_status().json()
+        worker_id = first.client.post("/v1/workers", json=worker).json()["worker_id"]
+        body = {"kinds": ["prepare"], "wait_s": 5}
+        claim = first.client.post(f"/v1/workers/{worker_id}/claim", json=body).json()
+        first.stop(signal.SIGKILL)
+    (folder / "incoming" / "upload-half").write_bytes(b"half")
+    with coordinator(folder) as second:
+        assert list((folder / "incoming").iterdir()) == []
+        assert second.client.get(f"/v1/blobs/{sha256}").content == b"test"
+        beat = {"task_id": claim["task_id"], "attempt": claim["attempt"]}
+        reply = second.client.post(f"/v1/workers/{worker_id}/heartbeat", json=beat)
+        assert reply.json() == {"stop": False, "reason": ""}
+        result = {"kind": "prepare", "scene": sha256, "texel_map": sha256, "scene_hash": sha256, "seconds": 1}
+        result |= {"tiles": [{"row": 0, "column": 0, "size": 8, "texels": 1}], "has_environment": False}
+        result |= {"has_light": True, "triangles": 1}
+        commit = second.client.post(
+            f"/v1/tasks/{claim['task_id']}/commit", json={"attempt": claim["attempt"], "result": result}
+        )
+        assert commit.status_code == 204
+        states = {s["kind"]: s["completed"] for s in second.client.get(f"/v1/jobs/{job['id']}").json()["stages"]}
+        assert states == {"prepare": 1, "render": 0, "fit": 0, "package": 0}
+        code, errors = second.stop(signal.SIGTERM)
+        assert code == 0 and "Traceback" not in errors
+    assert servers_of(folder) == []
+
+
+def test_a_killed_coordinator_takes_its_database_along(folder):
+    with coordinator(folder) as running:
+        assert len(servers_of(folder)) >= 1
+        running.stop(signal.SIGKILL)
+    deadline = time.monotonic() + 20
+    while servers_of(folder):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_interrupt_ends_waiting_requests_and_leaves_nothing(folder):
+    with coordinator(folder) as running:
+        began = time.monotonic()
+        code, errors = running.stop(signal.SIGINT)
+        assert code == 0 and time.monotonic() - began < 15 and "Traceback" not in errors
+    assert servers_of(folder) == []
+
+
+def test_a_second_coordinator_on_the_same_folder_is_refused(folder):
+    with coordinator(folder):
+        second = subprocess.run(
+            [sys.executable, "-m", "kiln_service", "--data", str(folder), "--port", "0", "--json"],
+            capture_output=True,
+            text=True,
+            timeout=30,
+        )
+    assert second.returncode == 4 and "another coordinator" in second.stderr and "Traceback" not in second.stderr
+    assert json.loads(second.stdout)["error"]["code"] == "conflict"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "word"),
+    [
+        (["--port", "0"], 3, "--data"),
+        (["--data", "{folder}", "--port", "70000"], 3, "port"),
+        (["--data", "{folder}", "--config", "{folder}/none.json"], 3, "none.json"),
+        (["--data", "/proc/nothing"], 7, "/proc/nothing"),
+    ],
+)
+def test_bad_arguments_are_sentences(folder, arguments, code, word):
+    command = [argument.format(folder=folder) for argument in arguments]
+    done = subprocess.run([sys.executable, "-m", "kiln_service", *command], capture_output=True, text=True, timeout=30)
+    assert done.returncode == code and word in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_port_that_is_taken_is_a_sentence(shared, folder):
+    port = shared.url.rsplit(":", 1)[1]
+    arguments = ["--data", str(folder), "--port", port, "--database", shared.config.database]
+    done = subprocess.run(
+        [sys.executable, "-m", "kiln_service", *arguments], capture_output=True, text=True, timeout=30
+    )
+    assert done.returncode == 4 and port in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_lock_file_with_a_recycled_pid_does_not_stop_the_database(folder):
+    """A machine that lost power leaves postmaster.pid, whose number may be another process's by now."""
+    with EmbeddedPostgres(folder / "postgres") as server:
+        kept = (server.folder / "postmaster.pid").read_text()
+    lines = kept.split("\n")
+    (folder / "postgres" / "postmaster.pid").write_text("\n".join([str(os.getpid()), *lines[1:]]))
+    with EmbeddedPostgres(folder / "postgres") as server:
+        assert server.alive()
+
+
+def test_a_server_that_was_left_behind_is_replaced(folder):
+    left = EmbeddedPostgres(folder / "postgres")
+    left.start()
+    with EmbeddedPostgres(folder / "postgres") as server:
+        assert server.alive() and not left.alive()
+        assert len(servers_of(folder)) == 1
+
+
+def test_the_coordinator_loads_no_renderer_and_no_arrays():
+    program = "import sys, kiln_service.serve, kiln_service.generate; print(*sorted(sys.modules))"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert "fastapi" in loaded and "psycopg" in loaded
+    assert not {"mitsuba", "drjit", "torch", "numpy", "kiln_workers"} & set(loaded)
