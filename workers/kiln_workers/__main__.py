@@ -8,6 +8,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import secrets
 import sys
 import tempfile
@@ -122,10 +123,11 @@ def _token(options: argparse.Namespace) -> str:
             raise InputError(f"cannot be read: {error.strerror}", where=str(options.token_file)) from None
     else:
         token = options.token or ""
+    remedy = "Pass --token or --token-file, or set LIGHTKILN_TOKEN."
     if not token:
-        raise AuthError(
-            "no token is given", where="--token", remedy="Pass --token or --token-file, or set LIGHTKILN_TOKEN."
-        )
+        raise AuthError("no token is given", where="--token", remedy=remedy)
+    if not re.fullmatch(r"[\x21-\x7e]+", token):
+        raise AuthError("the token has characters that no token has", where="--token", remedy=remedy)
     return token
 
 

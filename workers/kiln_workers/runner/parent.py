@@ -104,7 +104,7 @@ class Worker:
         except Interrupted:
             self._announce("worker.stopping", {})
         finally:
-            self._close()
+            self.close()
 
     def step(self) -> None:
         """Claim and run one task, if there is one."""
@@ -280,7 +280,7 @@ class Worker:
             self._closing = True
             raise Interrupted
 
-    def _close(self) -> None:
+    def close(self) -> None:
         """Kill the child and give its task back, so that it is queued again at once."""
         self._closing = True
         if self._child is not None:
