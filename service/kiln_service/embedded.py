@@ -24,7 +24,7 @@ import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 
 import psycopg
@@ -41,7 +41,7 @@ SOCKET_PATH_MAX: Final = 100
 """Bytes; the kernel's bound for a Unix socket's path is 107."""
 PR_SET_PDEATHSIG: Final = 1
 
-SERVER_SETTINGS: Final[Mapping[str, str]] = {
+SERVER_SETTINGS: Final = {
     "listen_addresses": "",
     "unix_socket_permissions": "0700",
     "max_connections": "64",
@@ -52,9 +52,13 @@ SERVER_SETTINGS: Final[Mapping[str, str]] = {
 
 
 class EmbeddedPostgres:
-    """A context that starts the server of `folder` and stops it; `dsn` connects to it."""
+    """A context that starts the server of `folder` and stops it; `dsn` connects to it.
 
-    def __init__(self, folder: Path) -> None:
+    `settings` are server settings besides SERVER_SETTINGS (tests that need no durability turn fsync off).
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, str] = MappingProxyType({})) -> None:
+        self._settings = {**SERVER_SETTINGS, **settings}
         self.folder = folder.absolute()
         self._bin = _binaries(self.folder)
         self._user = _system_user() if os.geteuid() == 0 else None
@@ -88,7 +92,7 @@ class EmbeddedPostgres:
         self._stop_leftover()
         with self.log_file.open("ab") as output:
             self._process = subprocess.Popen(
-                [str(self._bin / "postgres"), "-D", str(self.folder), "-k", str(self._sockets), *_flags()],
+                [str(self._bin / "postgres"), "-D", str(self.folder), "-k", str(self._sockets), *self._flags()],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
@@ -114,6 +118,9 @@ class EmbeddedPostgres:
     def alive(self) -> bool:
         """Whether the server's process runs."""
         return self._process is not None and self._process.poll() is None
+
+    def _flags(self) -> list[str]:
+        return [part for key, value in self._settings.items() for part in ("-c", f"{key}={value}")]
 
     def _identity(self) -> dict[str, Any]:
         """Popen arguments that drop root, if we are root."""
@@ -179,10 +186,6 @@ class EmbeddedPostgres:
                         remedy=f"Read {self.log_file}, or pass --database with a connection string.",
                     ) from None
             time.sleep(0.05)
-
-
-def _flags() -> list[str]:
-    return [part for key, value in SERVER_SETTINGS.items() for part in ("-c", f"{key}={value}")]
 
 
 def _binaries(folder: Path) -> Path:

@@ -28,13 +28,16 @@ SLOW_REAPER = Timing(heartbeat_s=0.2, stale_s=600, poll_s=0.1, maintenance_s=0.3
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[EmbeddedPostgres]:
     # Not under pytest's folder: every pytest that starts makes that one private again, and the server is another user.
-    with TemporaryDirectory(prefix="kiln-test-") as folder, EmbeddedPostgres(Path(folder) / "postgres") as server:
+    with (
+        TemporaryDirectory(prefix="kiln-test-") as folder,
+        EmbeddedPostgres(Path(folder) / "postgres", {"fsync": "off", "full_page_writes": "off"}) as server,
+    ):
         yield server
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def folder() -> Iterator[Path]:
-    """A data folder for a coordinator with an embedded database."""
+    """A data folder for coordinators with an embedded database, one after the other: to make one takes seconds."""
     with TemporaryDirectory(prefix="kiln-test-") as folder:
         yield Path(folder)
 

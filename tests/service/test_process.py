@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import httpx
 import pytest
 
 from kiln_service.embedded import EmbeddedPostgres
+
+WORKER = {"name": "w", "kinds": ["prepare"], "memory_bytes": 1, "threads": 1, "device": "none", "version": "0"}
 
 
 class Process:
@@ -66,14 +69,13 @@ def servers_of(folder):
 
 def test_kill_and_restart(folder):
     """kill -9 in the middle of a job: the same worker goes on with the same attempt."""
-    worker = {"name": "w", "kinds": ["prepare"], "memory_bytes": 1, "threads": 1, "device": "none", "version": "0"}
     with coordinator(folder) as first:
         sha256 = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
         first.client.put(f"/v1/blobs/{sha256}", content=b"test").raise_for_status()
         bundle = {"entry": "a.glb", "files": {"a.glb": sha256}}
         request = {"name": "n", "preset": "draft", "bundle": bundle}
         job = first.client.post("/v1/jobs", json=request).raise_for_status().json()
-        worker_id = first.client.post("/v1/workers", json=worker).json()["worker_id"]
+        worker_id = first.client.post("/v1/workers", json=WORKER).json()["worker_id"]
         body = {"kinds": ["prepare"], "wait_s": 5}
         claim = first.client.post(f"/v1/workers/{worker_id}/claim", json=body).json()
         first.stop(signal.SIGKILL)
@@ -109,10 +111,20 @@ def test_a_killed_coordinator_takes_its_database_along(folder):
 
 
 def test_interrupt_ends_waiting_requests_and_leaves_nothing(folder):
-    with coordinator(folder) as running:
+    with coordinator(folder) as running, ThreadPoolExecutor() as threads:
+        worker_id = running.client.post("/v1/workers", json=WORKER).json()["worker_id"]
+        body = {"kinds": ["package"], "wait_s": 30}
+        polls = [
+            threads.submit(
+                httpx.post, f"{running.url}/v1/workers/{worker_id}/claim", json=body, headers=headers, timeout=60
+            )
+            for headers in [running.client.headers] * 3
+        ]
+        time.sleep(0.5)
         began = time.monotonic()
         code, errors = running.stop(signal.SIGINT)
-        assert code == 0 and time.monotonic() - began < 15 and "Traceback" not in errors
+        assert code == 0 and time.monotonic() - began < 10 and "Traceback" not in errors
+        assert [poll.result().status_code for poll in polls] == [204, 204, 204]
     assert servers_of(folder) == []
 
 
