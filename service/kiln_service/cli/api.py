@@ -31,7 +31,7 @@ OnBytes = Callable[[int], None]
 class Api:
     """One coordinator as a client sees it. Without a token only `ready` is answered."""
 
-    def __init__(self, url: str, token: str | None, *, patience_s: float = 15.0) -> None:
+    def __init__(self, url: str, token: str | None, *, patience_s: float) -> None:
         self.url, self._patience_s = url.rstrip("/"), patience_s
         if token is not None and not re.fullmatch(r"[\x21-\x7e]+", token):
             raise AuthError("the token has characters that no token has", remedy="Pass it as it is in the token file.")

@@ -221,7 +221,8 @@ def watch(
     json: Annotated[bool, typer.Option("--json", help="One JSON document a line at every change.")] = False,
 ) -> None:
     """Follow a job until it is over; the exit code tells how it ended."""
-    with options.connect(url, token, data) as api, make_display(quiet=json) as display:
+    # A coordinator that is restarted meanwhile does not end the watching.
+    with options.connect(url, token, data, patience_s=60) as api, make_display(quiet=json) as display:
         view = follow(api, job, display, on_change=print_json if json else None)
     if json and view.state is not JobState.COMPLETED:
         # The last line already tells the error; only the code is missing.

@@ -40,9 +40,9 @@ EnvironmentRotation = Annotated[
 ]
 
 
-def connect(url: str, token: str | None, data: Path | None) -> Api:
+def connect(url: str, token: str | None, data: Path | None, *, patience_s: float = 5.0) -> Api:
     """A client with the token given, or the one in the coordinator's data folder."""
-    return Api(url, token or read_token(data))
+    return Api(url, token or read_token(data), patience_s=patience_s)
 
 
 def read_token(data: Path | None) -> str:
