@@ -14,7 +14,8 @@ from kiln_workers.scene.environment import load_environment
 from kiln_workers.scene.gltf import read_gltf
 from kiln_workers.scene.mitsuba_xml import read_mitsuba_xml
 from kiln_workers.scene.model import Scene
-from kiln_workers.scene.trimesh_files import read_obj, read_ply
+from kiln_workers.scene.obj import read_obj
+from kiln_workers.scene.ply import read_ply
 
 READERS: Final[Mapping[str, Callable[[Path, str], Scene]]] = {
     ".gltf": read_gltf,

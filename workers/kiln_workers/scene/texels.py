@@ -7,8 +7,8 @@ that contains the centre wins, else the nearest. `alpha` is the material's rough
 
 Terminator of smooth normals: paths start from the point that Hanika 2021 ("Hacking the Shadow Terminator", Ray Tracing
 Gems II, chapter 4) gives: the flat triangle's point is lifted to the interpolation of its projections on the vertices'
-tangent planes, where those lie above it. It follows the surface that the normals pretend, so facets do not shadow each other.
-Limited to half a texel; flat-shaded and concave faces are not moved.
+tangent planes, where those lie above it. It follows the surface that the normals pretend, so facets do not shadow each
+other. Limited to half a texel; flat-shaded and concave faces are not moved.
 """
 
 from typing import Final
@@ -115,7 +115,7 @@ def _wrapped(index: Ints, size: int, wrap: str) -> Ints:
         return np.asarray(np.mod(index, size))
     if wrap == "mirror":
         folded = np.mod(index, 2 * size)
-        return np.minimum(folded, 2 * size - 1 - folded)
+        return np.asarray(np.minimum(folded, 2 * size - 1 - folded))
     return np.clip(index, 0, size - 1)
 
 

@@ -1,0 +1,203 @@
+"""Reader of Wavefront OBJ with MTL materials, by the format's public description (Wavefront, "Object Files").
+
+An own reader, as general ones open whatever file a material library names and drop textures in silence. Polygons become
+fans; vertices are split where position, texture and normal indices differ. MTL's physically based keys (Pr, Pm) are
+used where present; otherwise Phong's exponent gives alpha^2 = 2 / (Ns + 2) (Walter et al. 2007, section 5.1), without
+highlight roughness 1. `Ke` is radiance.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from kiln_schemas.errors import InputError
+from kiln_workers.scene.bundle import BundleFolder
+from kiln_workers.scene.geometry import RawMesh, check_triangle_count, place, unique_names
+from kiln_workers.scene.gltf_materials import make_image
+from kiln_workers.scene.model import Image, Material, Mesh, Scene, TextureRef
+
+DEFAULT = Material("default")
+
+
+@dataclass
+class _Group:
+    """Faces of one object and material: corners as (position, texture, normal) indices, -1 where absent."""
+
+    name: str
+    material: str
+    corners: list[tuple[int, int, int]] = field(default_factory=list)
+
+
+@dataclass
+class ObjFile:
+    """A parsed OBJ file, materials not yet read."""
+
+    meshes: list[RawMesh]  # `material` indexes `materials`
+    materials: list[str]
+    libraries: list[str]
+
+
+def read_obj(folder: Path, entry: str) -> Scene:
+    """The scene of an OBJ file and its material libraries."""
+    bundle = BundleFolder(folder, entry)
+    parsed = parse_obj(bundle.read(Path(entry).name, "scene"), entry)
+    notes: list[str] = []
+    images: list[Image] = []
+    known = _read_libraries(bundle, parsed.libraries, images, notes)
+    missing = sorted({name for name in parsed.materials if name and name not in known})
+    notes += [f"'{entry}': material '{name}' is not defined; the default is used." for name in missing]
+    materials = tuple(known.get(name, DEFAULT) for name in parsed.materials)
+    meshes: list[Mesh] = []
+    for raw in parsed.meshes:
+        mesh, said = place(raw)
+        notes += said
+        meshes += [mesh] if mesh is not None else []
+    return Scene(tuple(meshes), materials, tuple(images), notes=tuple(notes))
+
+
+def parse_obj(data: bytes, where: str) -> ObjFile:
+    """Meshes of an OBJ file, one for each object and material; InputError names the line at fault."""
+    vectors: dict[str, list[tuple[float, ...]]] = {"v": [], "vt": [], "vn": []}
+    groups: dict[tuple[str, str], _Group] = {}
+    libraries: list[str] = []
+    name, material = Path(where).stem, ""
+    triangles = 0
+    for number, key, rest in _lines(data):
+        try:
+            if key in vectors:
+                vectors[key].append(tuple(float(word) for word in rest.split()[: 2 if key == "vt" else 3]))
+            elif key in ("o", "g"):
+                name = rest or name
+            elif key == "usemtl":
+                material = rest
+            elif key == "mtllib":
+                libraries.append(rest)
+            elif key == "f":
+                fan = _fan([_corner(word, vectors) for word in rest.split()])
+                triangles += len(fan) // 3
+                check_triangle_count(triangles, where)
+                groups.setdefault((name, material), _Group(name, material)).corners.extend(fan)
+        except (ValueError, IndexError):
+            raise InputError(
+                f"line {number} is not understood: '{key} {rest[:60]}'", where=where, remedy="Export it again."
+            ) from None
+    materials = list(dict.fromkeys(group.material for group in groups.values()))
+    arrays = {key: _array(rows, 2 if key == "vt" else 3, where) for key, rows in vectors.items()}
+    names = unique_names(group.name for group in groups.values())
+    meshes = [
+        _mesh(group, name, materials.index(group.material), arrays)
+        for name, group in zip(names, groups.values(), strict=True)
+    ]
+    return ObjFile(meshes, materials, libraries)
+
+
+def _lines(data: bytes) -> Iterator[tuple[int, str, str]]:
+    text = data.decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
+    for number, line in enumerate(text.splitlines(), start=1):
+        key, _, rest = line.split("#", 1)[0].strip().partition(" ")
+        if key:
+            yield number, key, rest.strip()
+
+
+def _corner(word: str, vectors: dict[str, list[tuple[float, ...]]]) -> tuple[int, int, int]:
+    parts = [*word.split("/"), "", ""][:3]
+    found = []
+    for part, key in zip(parts, ("v", "vt", "vn"), strict=True):
+        count = len(vectors[key])
+        index = int(part) if part else 0
+        resolved = index - 1 if index > 0 else count + index if index < 0 else -1
+        if part and not 0 <= resolved < count:
+            raise IndexError(part)
+        found.append(resolved)
+    return found[0], found[1], found[2]
+
+
+def _fan(corners: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+    if len(corners) < 3:
+        raise ValueError("a face has three corners or more")
+    return [corner for i in range(1, len(corners) - 1) for corner in (corners[0], corners[i], corners[i + 1])]
+
+
+def _array(rows: list[tuple[float, ...]], width: int, where: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    if any(len(row) < width for row in rows):
+        raise InputError(f"a vertex has fewer than {width} numbers", where=where, remedy="Export it again.")
+    return np.array(rows, dtype=np.float64).reshape(-1, width)
+
+
+def _mesh(
+    group: _Group, name: str, material: int, arrays: dict[str, np.ndarray[tuple[int, int], np.dtype[np.float64]]]
+) -> RawMesh:
+    corners, faces = np.unique(np.array(group.corners, dtype=np.int64), axis=0, return_inverse=True)
+    uv = None
+    if (corners[:, 1] >= 0).all():
+        uv = arrays["vt"][corners[:, 1]] * [1.0, -1.0] + [0.0, 1.0]  # v upwards in OBJ
+    return RawMesh(
+        name=name,
+        positions=arrays["v"][corners[:, 0]],
+        faces=faces.reshape(-1, 3),
+        material=material,
+        normals=arrays["vn"][corners[:, 2]] if (corners[:, 2] >= 0).all() else None,
+        uv=uv,
+    )
+
+
+def _read_libraries(
+    bundle: BundleFolder, libraries: list[str], images: list[Image], notes: list[str]
+) -> dict[str, Material]:
+    materials: dict[str, Material] = {}
+    for library in dict.fromkeys(libraries):
+        name = bundle.name(library)
+        if not (bundle.folder / name).is_file():
+            notes.append(f"'{bundle.origin}': the material library '{library}' is missing; defaults are used.")
+            continue
+        inner = BundleFolder(bundle.folder, name)
+        tables: dict[str, dict[str, str]] = {}
+        current: dict[str, str] = {}
+        for _, key, rest in _lines(bundle.read(library, "material library")):
+            if key == "newmtl":
+                current = tables.setdefault(rest, {})
+            else:
+                current[key] = rest
+        for title, table in tables.items():
+            materials[title] = _material(title, table, inner, images)
+    return materials
+
+
+def _material(title: str, table: dict[str, str], bundle: BundleFolder, images: list[Image]) -> Material:
+    def numbers(key: str, default: tuple[float, ...]) -> tuple[float, ...]:
+        if key not in table:
+            return default
+        try:
+            values = tuple(float(word) for word in table[key].split())
+        except ValueError:
+            values = ()
+        if len(values) not in (1, 3) or not np.isfinite(values).all() or min(values) < 0.0:
+            raise InputError(
+                f"'{key} {table[key]}' is not understood", where=f"material '{title}'", remedy="Mend the library."
+            )
+        return values * 3 if len(values) == 1 and len(default) == 3 else values
+
+    red, green, blue = (min(value, 1.0) for value in numbers("Kd", (0.8, 0.8, 0.8)))
+    glow = numbers("Ke", (0.0, 0.0, 0.0))
+    shiny = max(numbers("Ks", (0.0, 0.0, 0.0))) > 0.0 and "Ns" in table
+    phong = (2.0 / (numbers("Ns", (0.0,))[0] + 2.0)) ** 0.25 if shiny else 1.0
+    return Material(
+        name=title,
+        base_color=(red, green, blue, 1.0),
+        base_color_texture=_texture(table.get("map_Kd"), title, bundle, images),
+        metallic=min(numbers("Pm", (0.0,))[0], 1.0),
+        roughness=min(numbers("Pr", (phong,))[0], 1.0),
+        emission=(glow[0], glow[1], glow[2]),
+        emission_texture=_texture(table.get("map_Ke"), title, bundle, images) if max(glow) > 0.0 else None,
+    )
+
+
+def _texture(line: str | None, title: str, bundle: BundleFolder, images: list[Image]) -> TextureRef | None:
+    if not line:
+        return None
+    name = line.split()[-1] if line.startswith("-") else line
+    data = bundle.read(name, "texture")
+    images.append(make_image(data, name, True, f"material '{title}', texture '{name}'"))
+    return TextureRef(len(images) - 1)
