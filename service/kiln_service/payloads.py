@@ -26,13 +26,12 @@ async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Payload:
         case TaskKind.PREPARE:
             return PreparePayload(**common, bundle=job.bundle)
         case TaskKind.RENDER:
-            prepared = await _prepared(tx, job)
-            return RenderPayload(**common, scene=prepared.scene, texel_map=prepared.texel_map, tile=task.spec["tile"])
+            return RenderPayload(**common, **await tx.one("prepared_blobs", job_id=job.id), tile=task.spec["tile"])
         case TaskKind.FIT:
             return FitPayload(
                 **common,
                 function=task.spec["function"],
-                texel_map=(await _prepared(tx, job)).texel_map,
+                texel_map=(await tx.one("prepared_blobs", job_id=job.id))["texel_map"],
                 renders=await _renders(tx, job),
             )
         case TaskKind.PACKAGE:

@@ -202,7 +202,7 @@ def serving(config: ServiceConfig) -> Iterator[Coordinator]:
     """Run a coordinator in a thread for the time of the block."""
     app = create_app(config)
     server = uvicorn.Server(uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=2))
-    with socket.socket() as listening:
+    with socket.socket(proto=socket.IPPROTO_TCP) as listening:
         listening.bind(("127.0.0.1", 0))
         listening.listen(128)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})

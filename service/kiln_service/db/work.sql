@@ -28,6 +28,11 @@ SELECT count(*) AS tasks FROM tasks WHERE job_id = %(job_id)s AND state = 'activ
 -- Results of a job's tasks of a kind, in the order of planning.
 SELECT result FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state = 'completed' ORDER BY ordinal;
 
+-- name: prepared_blobs
+-- The blobs that a job's prepare task made; its whole result may list thousands of tiles.
+SELECT result ->> 'scene' AS scene, result ->> 'texel_map' AS texel_map
+FROM tasks WHERE job_id = %(job_id)s AND kind = 'prepare' AND state = 'completed';
+
 -- name: task_deferred
 -- Remember the queue jobs that carry tasks.
 UPDATE tasks
