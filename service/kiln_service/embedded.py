@@ -54,7 +54,8 @@ SERVER_SETTINGS: Final = {
 class EmbeddedPostgres:
     """A context that starts the server of `folder` and stops it; `dsn` connects to it.
 
-    `settings` are server settings besides SERVER_SETTINGS (tests that need no durability turn fsync off).
+    Start it in the main thread: the kernel stops the server when the thread that started it ends. `settings` are
+    server settings besides SERVER_SETTINGS (tests that need no durability turn fsync off).
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, str] = MappingProxyType({})) -> None:

@@ -7,7 +7,7 @@ transaction under the job's lock, so the last tile's fan-in happens once.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Final
 
 from psycopg.types.json import Jsonb
@@ -63,12 +63,19 @@ class Work:
             )
         return worker_id
 
-    async def claim(self, worker_id: str, request: ClaimRequest) -> Claim | None:
-        """The next task of these kinds, waiting for one as long as the worker allows; None where there is none."""
+    async def claim(
+        self, worker_id: str, request: ClaimRequest, is_gone: Callable[[], Awaitable[bool]]
+    ) -> Claim | None:
+        """The next task of these kinds, waiting for one as long as the worker allows; None where there is none.
+
+        `is_gone` tells whether the worker hung up: a task given to nobody would wait for the reaper.
+        """
         deadline = time.monotonic() + request.wait_s
         with self._signals.watch(QUEUED_CHANNEL) as woken:
             while True:
                 woken.clear()
+                if await is_gone():
+                    return None
                 found = await self._claim_once(worker_id, request.kinds)
                 if isinstance(found, Claim):
                     return found

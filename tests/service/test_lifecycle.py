@@ -1,7 +1,11 @@
 """A job from its submission to its artifacts, and what clients see of it on the way."""
 
+import json
+import socket
 import threading
 import time
+
+import httpx
 
 
 def test_a_job_runs_through_all_stages(home):
@@ -85,6 +89,21 @@ def test_a_waiting_claim_gets_the_task_that_comes(home):
     thread.join()
     claim, at = got[0]
     assert claim["payload"]["kind"] == "prepare" and at - submitted < 5
+
+
+def test_a_worker_that_hung_up_is_given_nothing(home):
+    gone, other = home.worker("gone"), home.worker("other")
+    body = json.dumps({"kinds": ["prepare"], "wait_s": 30})
+    address = httpx.URL(home.url)
+    with socket.create_connection((address.host, address.port)) as connection:
+        connection.sendall(
+            f"POST /v1/workers/{gone.id}/claim HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {home.token}\r\n"
+            f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n{body}".encode()
+        )
+        time.sleep(0.3)
+    home.submit()
+    time.sleep(0.3)
+    assert other.must_claim()["attempt"] == 1
 
 
 def test_jobs_are_paged_and_filtered(home):

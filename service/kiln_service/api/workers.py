@@ -1,6 +1,6 @@
 """Routes for workers: register, claim, heartbeat, and the end of a task."""
 
-from fastapi import APIRouter, Depends, Response
+from fastapi import APIRouter, Depends, Request, Response
 
 from kiln_schemas.tasks import (
     Checkpoint,
@@ -31,9 +31,9 @@ async def register(registration: WorkerRegistration, parts: PartsHere) -> Worker
     response_model=Claim,
     responses=problems(404, 422) | {204: {"description": "Nothing to do within `wait_s`"}},
 )
-async def claim(worker_id: str, request: ClaimRequest, parts: PartsHere) -> Claim | Response:
+async def claim(worker_id: str, request: ClaimRequest, parts: PartsHere, http: Request) -> Claim | Response:
     """Take the next task; held open up to `wait_s` while there is none."""
-    return await parts.work.claim(worker_id, request) or Response(status_code=204)
+    return await parts.work.claim(worker_id, request, http.is_disconnected) or Response(status_code=204)
 
 
 @router.post("/workers/{worker_id}/heartbeat", responses=problems(404, 422))
