@@ -41,7 +41,11 @@ class GltfBuilder:
         return len(self.document["accessors"]) - 1
 
     def mesh(
-        self, positions: Any = TRIANGLE, indices: Sequence[int] | None = (0, 1, 2), material: int | None = None, **more: Any
+        self,
+        positions: Any = TRIANGLE,
+        indices: Sequence[int] | None = (0, 1, 2),
+        material: int | None = None,
+        **more: Any,
     ) -> int:
         """Append a mesh; `more` are further attributes by name."""
         attributes = {"POSITION": self.accessor(np.asarray(positions, dtype=np.float32))}
@@ -85,7 +89,11 @@ def write_image() -> Callable[[Path, Any], Path]:
 
 
 def quad_mesh(
-    name: str, corner: Sequence[float], s: Sequence[float], t: Sequence[float], uv_box: tuple[float, float, float, float]
+    name: str,
+    corner: Sequence[float],
+    s: Sequence[float],
+    t: Sequence[float],
+    uv_box: tuple[float, float, float, float],
 ) -> Mesh:
     """A parallelogram with light-map UV over (u0, v0, u1, v1), normal s x t."""
     c, a, b = (np.array(v, dtype=np.float32) for v in (corner, s, t))

@@ -131,7 +131,8 @@ def test_punctual_lights_are_placed_by_their_nodes(gltf, tmp_path):
     }
     down = [-np.sin(np.pi / 4), 0, 0, np.cos(np.pi / 4)]
     nodes = [{"mesh": 0}] + [
-        {"translation": [0, 4, 0], "rotation": down, "extensions": {"KHR_lights_punctual": {"light": i}}} for i in (0, 1)
+        {"translation": [0, 4, 0], "rotation": down, "extensions": {"KHR_lights_punctual": {"light": i}}}
+        for i in (0, 1)
     ]
     scene = load_scene(tmp_path, gltf.write(tmp_path, nodes=nodes))
     spot, sun = scene.lights
@@ -177,7 +178,9 @@ def test_a_missing_texture_is_named(gltf, tmp_path):
     assert "the texture 'absent.png' is missing" in refused(tmp_path, gltf.write(tmp_path))
 
 
-@pytest.mark.parametrize("uri", ["../outside.png", "/etc/passwd", "..%2Foutside.png", "a/../../outside.png", "C:\\x.png"])
+@pytest.mark.parametrize(
+    "uri", ["../outside.png", "/etc/passwd", "..%2Foutside.png", "a/../../outside.png", "C:\\x.png"]
+)
 def test_a_path_that_leaves_the_bundle_is_refused(gltf, tmp_path, uri):
     folder = tmp_path / "bundle"
     folder.mkdir()
@@ -207,7 +210,8 @@ def test_cycles_and_dangling_indices_are_refused(gltf, tmp_path):
     assert "reached twice" in refused(tmp_path, gltf.write(tmp_path, nodes=nodes))
     assert "mesh 5 is named" in refused(tmp_path, gltf.write(tmp_path, nodes=[{"mesh": 5}]))
     assert "not finite" in refused(
-        tmp_path, gltf.write(tmp_path, nodes=[{"children": [1], "scale": [1e300] * 3}, {"mesh": 0, "scale": [1e300] * 3}])
+        tmp_path,
+        gltf.write(tmp_path, nodes=[{"children": [1], "scale": [1e300] * 3}, {"mesh": 0, "scale": [1e300] * 3}]),
     )
 
 
@@ -248,7 +252,9 @@ def test_broken_files_are_refused(tmp_path):
         "chunk.glb": b"glTF" + struct.pack("<IIII", 2, 20, 500, 0x4E4F534A),
         "text.gltf": b"no json",
         "deep.gltf": b"[" * 100_000,
-        "nan.gltf": json.dumps({"asset": {"version": "2.0"}, "nodes": [{"translation": [float("nan"), 0, 0]}]}).encode(),
+        "nan.gltf": json.dumps(
+            {"asset": {"version": "2.0"}, "nodes": [{"translation": [float("nan"), 0, 0]}]}
+        ).encode(),
         "list.gltf": b"[]",
         "one.gltf": b'{"asset": {"version": "1.0"}}',
         "scene.blend": b"",
