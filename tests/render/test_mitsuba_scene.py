@@ -70,6 +70,21 @@ def test_texture_transform(quad: Callable[..., Mesh]) -> None:
     np.testing.assert_allclose(emission_at(turned, 0.25, 0.75), 2.0 * np.array(BLUE), atol=1e-5)
 
 
+def test_cut_out_emitters_emit_where_they_are(
+    quad: Callable[..., Mesh], texels: Callable[..., TexelBatch], renderer: Callable[..., TileRenderer]
+) -> None:
+    """A lamp whose half is cut away gives half of the irradiance to a point below its middle."""
+    lamp = quad((-1, 1, -1), (2, 0, 0), (0, 0, 2))
+    alpha = Image("half", np.array([[[9, 9, 9, 255], [9, 9, 9, 0]]], np.uint8), srgb=True)
+    reference = TextureRef(0, wrap=("clamp", "clamp"))
+    got = []
+    for cutoff in (None, 0.5):
+        material = Material("m", (0, 0, 0, 1), reference, emission=(3.0, 3.0, 3.0), alpha_cutoff=cutoff)
+        tile = renderer(Scene((lamp,), (material,), (alpha,)), irradiance_samples=16384)
+        got.append(tile.render(texels([(0.0, 0.0, 0.0)])).irradiance[0])
+    np.testing.assert_allclose(got[1], 0.5 * got[0], rtol=0.02)
+
+
 @pytest.mark.parametrize("double_sided", [False, True])
 def test_emission_from_behind(quad: Callable[..., Mesh], double_sided: bool) -> None:
     material = Material("m", (0, 0, 0, 1), emission=(3.0, 2.0, 1.0), double_sided=double_sided)

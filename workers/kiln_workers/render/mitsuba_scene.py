@@ -15,7 +15,16 @@ from kiln_workers.render import textures
 from kiln_workers.render.backend import select_variant
 from kiln_workers.render.emitters import register_emitters
 from kiln_workers.render.jit import dr, mi
-from kiln_workers.scene.model import Environment, Float32, LightKind, Material, Mesh, PunctualLight, Scene
+from kiln_workers.scene.model import (
+    Environment,
+    Float32,
+    LightKind,
+    Material,
+    Mesh,
+    PunctualLight,
+    Scene,
+    TextureRef,
+)
 
 MIN_ROUGHNESS: Final = 0.05
 """Below this the GGX peak outgrows float32 and no sampler finds it; alpha 0.0025 is a mirror at any image size here."""
@@ -206,20 +215,21 @@ def opacity(scene: Scene, material: Material, uv: Float32 | None) -> Any:
 def _emission(scene: Scene, material: Material, mesh: Mesh, weight: float) -> Any | None:
     if max(material.emission) <= 0.0:
         return None
-    radiance: dict[str, Any] = {"type": "rgb", "value": list(material.emission)}
-    textured = material.emission_texture is not None and mesh.uv is not None
-    if textured and material.emission_texture is not None:
-        pixels = textures.linear_pixels(scene.images[material.emission_texture.image])[..., :3]
-        factor = np.asarray(material.emission, np.float32)
-        radiance = textures.bitmap(np.maximum(pixels * factor, 0.0), material.emission_texture, mesh.uv)
     covered = 1.0 if material.alpha_cutoff is None else opacity(scene, material, mesh.uv)
     if covered == 0.0:
         return None
-    if not textured and covered == 1.0:
+    reference = material.emission_texture if mesh.uv is not None else None
+    if reference is None and covered == 1.0:
+        radiance = {"type": "rgb", "value": list(material.emission)}
         return mi.load_dict({"type": "area", "radiance": radiance, "sampling_weight": weight})
+    factor = np.asarray(material.emission, np.float32)
+    if reference is None:
+        reference, pixels = TextureRef(0), np.ones((2, 2, 3), np.float32)
+    else:
+        pixels = textures.linear_pixels(scene.images[reference.image])[..., :3]
     emitter: dict[str, Any] = {"type": "kiln_area", "sampling_weight": weight}
-    # As objects: nested in a plugin written in Python, a plain colour would arrive as three numbers.
-    emitter["radiance"] = mi.load_dict(radiance)
+    # As objects: a plugin written in Python would get a nested colour as three numbers.
+    emitter["radiance"] = mi.load_dict(textures.bitmap(np.maximum(pixels * factor, 0.0), reference, mesh.uv))
     if isinstance(covered, dict):
         emitter["opacity"] = mi.load_dict(covered)
     return mi.load_dict(emitter)

@@ -49,6 +49,7 @@ class LaneSums:
 
     radiance: Any  # Color3f: sum of weight times radiance
     weight: Any  # Float: sum of the weights of samples in use
+    paths: Any  # UInt32: samples in use
     back_faces: Any  # UInt32: paths whose first hit is the back of a single-sided surface
     dropped: Any  # UInt32: paths that were not finite
 
@@ -60,7 +61,6 @@ class PathTracer:
         self.scene = to_mitsuba(scene)
         self.max_depth = max_depth
         self.has_cutouts = any(scene.materials[mesh.material].alpha_cutoff is not None for mesh in scene.meshes)
-        self.has_emitters = len(self.scene.emitters()) > 0
         low, high = scene_bounds(scene)
         # Embree's and our own rounding grow with the size of triangles and with the distance from the origin.
         self.rounding = 2e-6 * scene_diagonal(scene) + 4e-6 * float(np.abs(np.stack([low, high])).max())
@@ -128,7 +128,8 @@ class PathTracer:
         width = dr.width(lanes)
         zeros = dr.zeros(mi.UInt32, width)
         radiance, weight_sum = dr.zeros(mi.Color3f, width), dr.zeros(mi.Float, width)
-        back_faces, dropped, sample, depth = mi.UInt32(zeros), mi.UInt32(zeros), mi.UInt32(zeros), mi.UInt32(zeros)
+        paths, back_faces, dropped = mi.UInt32(zeros), mi.UInt32(zeros), mi.UInt32(zeros)
+        sample, depth = mi.UInt32(zeros), mi.UInt32(zeros)
         state = mi.UInt64(lanes)
         origin, direction = dr.zeros(mi.Point3f, width), dr.zeros(mi.Vector3f, width)
         before, before_pdf = dr.zeros(mi.Point3f, width), dr.zeros(mi.Float, width)
@@ -136,7 +137,6 @@ class PathTracer:
         throughput, path_radiance = dr.zeros(mi.Color3f, width), dr.zeros(mi.Color3f, width)
         on_path = dr.zeros(mi.Bool, width)
         running = mi.Bool(samples > 0)
-        context = mi.BSDFContext()
 
         while running:
             # Begin the next path in every lane that is between paths.
@@ -157,35 +157,16 @@ class PathTracer:
             behind = si.is_valid() & (dr.dot(si.n, direction) > 0.0) & (thin == 0)
             back_faces += dr.select(on_path & behind & (depth == 0), 1, 0)
 
-            # Radiance emitted at the hit (or by the environment), weighted against next-event estimation.
-            reference = dr.zeros(mi.Interaction3f)
-            reference.p = before
-            seen = mi.DirectionSample3f(self.scene, si, reference)
-            sampled = on_path & (before_pdf > 0.0)
-            light_pdf = self.scene.pdf_emitter_direction(reference, seen, sampled)
             emits = on_path & (si.is_valid() | (depth > 0) | sees_environment)
-            emitted = seen.emitter.eval(si, emits)
-            path_radiance += (
-                throughput
-                * dr.select(emits, emitted, 0.0)
-                * _power_heuristic(before_pdf, dr.select(sampled, light_pdf, 0.0))
-            )
-
-            # Light that arrives at the hit straight from an emitter.
+            path_radiance += throughput * self._emitted(si, before, before_pdf, emits)
             scatters = on_path & si.is_valid() & (depth < self.max_depth) & ~behind
-            bsdf = si.bsdf()
             state, u = counters.pair(state)
-            ds, arriving = self.light_at(si, si.p, u, scatters)
-            local = si.to_local(ds.d)
-            value, pdf = bsdf.eval_pdf(context, si, local, scatters)
-            same_side = dr.dot(si.n, ds.d) * dr.dot(si.n, direction) < 0.0
-            share = dr.select(ds.delta, 1.0, _power_heuristic(ds.pdf, pdf))
-            path_radiance += dr.select(scatters & same_side, throughput * value * arriving * share, 0.0)
+            path_radiance += throughput * self._direct(si, direction, u, scatters)
 
             # Continue in a direction drawn from the BSDF.
             state, u = counters.pair(state)
             state, choice = counters.pair(state)
-            scattered, factor = bsdf.sample(context, si, choice.x, u, scatters)
+            scattered, factor = si.bsdf().sample(mi.BSDFContext(), si, choice.x, u, scatters)
             onwards = si.to_world(scattered.wo)
             scatters &= dr.dot(si.n, onwards) * dr.dot(si.n, direction) < 0.0
             throughput *= factor
@@ -201,6 +182,7 @@ class PathTracer:
             radiance += dr.select(counted & finite, path_weight * path_radiance, 0.0)
             weight_sum += dr.select(counted & finite, path_weight, 0.0)
             dropped += dr.select(counted & ~finite, 1, 0)
+            paths += dr.select(counted, 1, 0)
             sample += dr.select(ends, 1, 0)
             on_path = survives & running
             before, before_pdf = mi.Point3f(si.p), mi.Float(scattered.pdf)
@@ -208,7 +190,7 @@ class PathTracer:
             depth += 1
             running = on_path | (sample < samples)
 
-        return LaneSums(radiance, weight_sum, back_faces, dropped)
+        return LaneSums(radiance, weight_sum, paths, back_faces, dropped)
 
     @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
     def direct(self, lanes: Any, samples: Any, position: Any, normal: Any, shading_normal: Any) -> Any:
@@ -231,6 +213,29 @@ class PathTracer:
             total += dr.select(above & dr.all(dr.isfinite(arriving)), arriving, 0.0)
             sample += 1
         return total
+
+    def _emitted(self, si: Any, before: Any, before_pdf: Any, active: Any) -> Any:
+        """Radiance [Color3f] that the hit, or the environment, emits towards `before`.
+
+        Weighted against next-event estimation at `before`, unless `before_pdf` is 0 because there was none.
+        """
+        reference = dr.zeros(mi.Interaction3f)
+        reference.p = before
+        seen = mi.DirectionSample3f(self.scene, si, reference)
+        sampled = active & (before_pdf > 0.0)
+        light_pdf = dr.select(sampled, self.scene.pdf_emitter_direction(reference, seen, sampled), 0.0)
+        return dr.select(active, seen.emitter.eval(si, active), 0.0) * _power_heuristic(before_pdf, light_pdf)
+
+    def _direct(self, si: Any, direction: Any, sample: Any, active: Any) -> Any:
+        """Light [Color3f] that reaches the hit straight from an emitter and is scattered back along the ray.
+
+        Weighted against BSDF sampling.
+        """
+        ds, arriving = self.light_at(si, si.p, sample, active)
+        value, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+        same_side = dr.dot(si.n, ds.d) * dr.dot(si.n, direction) < 0.0
+        share = dr.select(ds.delta, 1.0, _power_heuristic(ds.pdf, pdf))
+        return dr.select(active & same_side, value * arriving * share, 0.0)
 
     def _orient(self, si: Any, ray: Any) -> None:
         """Replace an interpolated normal that faces away from the ray while the surface faces it, or vice versa."""

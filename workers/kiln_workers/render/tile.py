@@ -7,7 +7,7 @@ changes no byte of the result.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -27,7 +27,7 @@ from kiln_workers.sphere import octahedral
 Float16 = npt.NDArray[np.float16]
 Int64 = npt.NDArray[np.int64]
 
-BYTES_PER_LANE: Final = 160
+BYTES_PER_LANE: Final = 192
 """Inputs, outputs and their copies in NumPy, per lane of a wavefront (measured by benchmarks/render.py)."""
 
 LARGEST_WAVEFRONT: Final = 1 << 22
@@ -64,8 +64,19 @@ class TileImages:
     overflows: int  # values clamped to the fp16 range, and paths dropped because they were not finite
 
 
+Progress = Callable[[float], None]
+"""Told the fraction that is done; may raise to stop."""
+
+
+def silent(fraction: float) -> None:
+    """Nobody listens."""
+
+
 class TileRenderer:
-    """Renders batches of texels of one scene; keep it while the scene stays the same."""
+    """Renders batches of texels of one scene; keep it while the scene stays the same.
+
+    `memory_bytes` bounds what a wavefront takes besides the scene, the compiled kernels and the images themselves.
+    """
 
     def __init__(
         self, scene: Scene, scene_hash: str, settings: RenderSettings, memory_bytes: int, device: Device = "auto"
@@ -79,41 +90,43 @@ class TileRenderer:
         self.pixel_area = 4.0 / settings.image_size**2
         self.solid_angles = mi.Float(octahedral.pixel_solid_angles(settings.image_size).astype(np.float32).ravel())
 
-    def render(self, texels: TexelBatch, on_progress: Callable[[float], None] | None = None) -> TileImages:
+    def render(self, texels: TexelBatch, on_progress: Progress = silent) -> TileImages:
         """All images of the batch; `on_progress` is called with the fraction done and may raise to stop."""
-        report = on_progress or (lambda fraction: None)
-        light_field, back_faces, paths, overflows = self._light_fields(texels, lambda f: report(0.6 * f))
-        irradiance, irradiance_paths, dropped = self._irradiance(texels, lambda f: report(0.6 + 0.2 * f))
-        visibility = self._visibility(texels, lambda f: report(0.8 + 0.2 * f))
-        return TileImages(
-            light_field=light_field,
+        fields = self.render_light_fields(texels, lambda done: on_progress(0.6 * done))
+        irradiance, irradiance_paths, dropped = self._irradiance(texels, lambda done: on_progress(0.6 + 0.2 * done))
+        visibility = self._visibility(texels, lambda done: on_progress(0.8 + 0.2 * done))
+        on_progress(1.0)
+        return replace(
+            fields,
             visibility=visibility,
             irradiance=irradiance,
-            back_faces=back_faces,
-            paths=paths + irradiance_paths,
-            overflows=overflows + dropped,
+            paths=fields.paths + irradiance_paths,
+            overflows=fields.overflows + dropped,
         )
 
-    def _light_fields(self, texels: TexelBatch, report: Callable[[float], None]) -> tuple[Float16, Float32, int, int]:
+    def render_light_fields(self, texels: TexelBatch, on_progress: Progress = silent) -> TileImages:
+        """The light-field images and back faces alone; no visibility, irradiance zero."""
         size, samples = self.settings.image_size, self.settings.samples
         out = np.zeros((len(texels), size * size, 3), np.float16)
-        back = np.zeros(len(texels), np.int64)
-        hits = np.zeros(len(texels), np.int64)
+        back, paths = np.zeros(len(texels), np.int64), np.zeros(len(texels), np.int64)
         overflows = 0
-        lanes = lanes_above_horizon(texels.normal, size)
-        for part, fraction in self._wavefronts(lanes):
+        for part, fraction in self._wavefronts(lanes_above_horizon(texels.normal, size)):
             texel, pixel = part[:, 0], part[:, 1]
             sums = self._trace_pixels(texels, texel, pixel, samples)
-            weight = np.array(sums.weight)
-            mean = np.array(sums.radiance).T / np.maximum(weight, 1e-30)[:, None]
-            values, clamped = to_half(mean)
-            out[texel, pixel] = values
-            back += np.bincount(texel, weights=np.array(sums.back_faces), minlength=len(texels)).astype(np.int64)
-            hits += np.bincount(texel, minlength=len(texels)) * samples
+            mean = np.array(sums.radiance).T / np.maximum(np.array(sums.weight), 1e-30)[:, None]
+            out[texel, pixel], clamped = to_half(mean)
+            np.add.at(back, texel, np.array(sums.back_faces))
+            np.add.at(paths, texel, np.array(sums.paths))
             overflows += clamped + int(np.array(sums.dropped).sum())
-            report(fraction)
-        fractions = (back / np.maximum(hits, 1)).astype(np.float32)
-        return out.reshape(len(texels), size, size, 3), fractions, len(lanes) * samples, overflows
+            on_progress(fraction)
+        return TileImages(
+            light_field=out.reshape(len(texels), size, size, 3),
+            visibility=None,
+            irradiance=np.zeros((len(texels), 3), np.float32),
+            back_faces=(back / np.maximum(paths, 1)).astype(np.float32),
+            paths=int(paths.sum()),
+            overflows=overflows,
+        )
 
     def _trace_pixels(self, texels: TexelBatch, texel: Int64, pixel: Int64, samples: int) -> LaneSums:
         """One wavefront of light-field pixels."""
@@ -132,10 +145,10 @@ class TileRenderer:
 
         count = dr.full(mi.UInt32, samples, len(texel))
         sums: LaneSums = self.tracer.trace(lanes, count, start, False)
-        dr.eval(sums.radiance, sums.weight, sums.back_faces, sums.dropped)
+        dr.eval(sums.radiance, sums.weight, sums.paths, sums.back_faces, sums.dropped)
         return sums
 
-    def _irradiance(self, texels: TexelBatch, report: Callable[[float], None]) -> tuple[Float32, int, int]:
+    def _irradiance(self, texels: TexelBatch, on_progress: Progress) -> tuple[Float32, int, int]:
         samples = self.settings.irradiance_samples
         blocks = -(-samples // IRRADIANCE_BLOCK)
         total = np.zeros((len(texels), blocks, 3), np.float64)
@@ -148,7 +161,7 @@ class TileRenderer:
             # Sum each texel's blocks in one fixed order, whatever the wavefronts were.
             total[texel, block] = np.array(paths.radiance).T + np.array(direct).T
             dropped += int(np.array(paths.dropped).sum())
-            report(fraction)
+            on_progress(fraction)
         return (total.sum(axis=1) / samples).astype(np.float32), len(texels) * samples, dropped
 
     def _trace_irradiance(self, texels: TexelBatch, texel: Int64, block: Int64, counts: Int64) -> tuple[LaneSums, Any]:
@@ -175,7 +188,7 @@ class TileRenderer:
         dr.eval(paths.radiance, paths.dropped, direct)
         return paths, direct
 
-    def _visibility(self, texels: TexelBatch, report: Callable[[float], None]) -> Float16 | None:
+    def _visibility(self, texels: TexelBatch, on_progress: Progress) -> Float16 | None:
         if self.table is None:
             return None
         size = self.settings.image_size
@@ -194,7 +207,7 @@ class TileRenderer:
                 self.table, size, texels.alpha[numbers], lanes, np.array(seen), np.array(above)
             )
             out[lanes[:, 0] + first, lanes[:, 1]] = values.astype(np.float16)
-            report(min(first + group, len(texels)) / len(texels))
+            on_progress(min(first + group, len(texels)) / len(texels))
         return out.reshape(len(texels), size, size, 3)
 
     def _wavefronts(self, lanes: Int64) -> Iterator[tuple[Int64, float]]:
