@@ -37,6 +37,8 @@ RESTARTS: Final = 5
 RESTART_WINDOW_S: Final = 60.0
 WORKER_STOP_S: Final = 8.0
 COORDINATOR_STOP_S: Final = 40.0
+LOCAL_TIMING: Final = {"heartbeat_s": 2.0, "stale_s": 10.0, "maintenance_s": 2.0}
+"""Seconds (`kiln_service.config.Timing`). On one machine a lost worker is noticed sooner than on a farm."""
 PERMANENT: Final = frozenset({2, InputError.exit_code, AuthError.exit_code, MachineLacks.exit_code})
 """Exit codes after which a restart would end the same way."""
 TAIL_LINES: Final = 5
@@ -127,8 +129,15 @@ class LocalFarm:
         self._token_file = data / "token"
         logs = data / "logs"
         port = self.url.rpartition(":")[2]
-        coordinator = [sys.executable, "-m", "kiln_service", "--host", HOST, "--port", port, "--data", str(data)]
-        self.coordinator = Managed("coordinator", [*coordinator, "--json"], logs / "coordinator.log")
+        self._config_file = data / "coordinator.json"
+        self.coordinator = Managed(
+            "coordinator",
+            [
+                *(sys.executable, "-m", "kiln_service", "--config", str(self._config_file), "--json"),
+                *("--host", HOST, "--port", port, "--data", str(data)),
+            ],
+            logs / "coordinator.log",
+        )
         self.workers = [
             Managed(
                 f"worker {number}",
@@ -144,6 +153,7 @@ class LocalFarm:
 
     def __enter__(self) -> Self:
         (self.data / "logs").mkdir(parents=True, exist_ok=True)
+        self._config_file.write_text(json.dumps({"timing": LOCAL_TIMING}))
         return self
 
     def __exit__(

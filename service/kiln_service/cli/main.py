@@ -10,7 +10,7 @@ import signal
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, NoReturn
+from typing import Annotated, Final, NoReturn
 
 import typer
 from rich.markup import escape
@@ -38,7 +38,8 @@ from kiln_service.cli.output import (
 from kiln_service.cli.progress import follow, make_display, raise_unless_completed
 from kiln_service.cli.upload import upload_and_submit
 
-INTERRUPTED: int = 130
+INTERRUPTED: Final = 130
+NOTES_SHOWN: Final = 5
 
 app = typer.Typer(
     name="lightkiln",
@@ -99,8 +100,10 @@ def bake(
     else:
         spans = ", ".join(f"{kind} {duration(s)}" for kind, s in summary.stage_wall_seconds.items())
         results.print(f"Baked in {duration(summary.seconds)} ({spans}).")
-        for note in summary.notes:
+        for note in summary.notes[:NOTES_SHOWN]:
             results.print(f"note: {note}", markup=False)
+        if len(summary.notes) > NOTES_SHOWN:
+            results.print(f"{len(summary.notes) - NOTES_SHOWN} more notes are in the manifest.")
     for word, path in (("package", summary.out), ("manifest", summary.manifest), ("report", summary.report)):
         if path is not None:
             results.print(f"{word:9} {shown_path(Path(path).absolute())}", markup=False, soft_wrap=True)
