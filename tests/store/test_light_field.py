@@ -1,0 +1,242 @@
+"""The light-field store against stock zarr-python, a rival, a full disk, killed writers and a real S3 server."""
+
+import json
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+
+from kiln_schemas.errors import Conflict, InputError, InternalError, MachineLacks, NotFound
+from kiln_schemas.settings import Function
+from kiln_schemas.tasks import Tile
+from kiln_workers.store.light_field import LightFieldStore
+
+R, TILE, SHAPE = 16, 8, (20, 24)
+PLACE = Tile(row=8, column=16, size=TILE, texels=4)
+COVERED = np.array([0, 3, 17, 63])
+
+
+def make(url: str, **changes: object) -> LightFieldStore:
+    settings: dict[str, object] = {
+        "shape": SHAPE,
+        "image_size": R,
+        "tile": TILE,
+        "functions": tuple(Function),
+        "attributes": {"scene_hash": "ab" * 32, "settings": {"preset": "draft"}},
+    }
+    return LightFieldStore.create(url, **(settings | changes))  # type: ignore[arg-type]
+
+
+def images(count: int, seed: int = 0) -> np.ndarray:
+    values = np.random.default_rng(seed).random((count, R, R, 3)).astype(np.float16)
+    values[1:2] = 0.0  # a covered texel may be black
+    return values
+
+
+def fill(store: LightFieldStore, seed: int = 0) -> None:
+    irradiance = np.arange(12, dtype=np.float32).reshape(4, 3)
+    store.write_tile(PLACE, COVERED, images(4, seed), images(4, seed + 1), irradiance)
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> str:
+    return f"file://{tmp_path}/a store"
+
+
+def folder(url: str) -> Path:
+    return Path(url.removeprefix("file://"))
+
+
+def objects(url: str) -> dict[str, bytes]:
+    root = folder(url)
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def test_reads_back_what_was_written(url: str) -> None:
+    fill(make(url))
+    store = LightFieldStore.open(url)
+    for seed, function in enumerate(Function):
+        np.testing.assert_array_equal(store.read_tile(function, PLACE, COVERED), images(4, seed))
+        np.testing.assert_array_equal(store.read_tile(function, PLACE, COVERED[[2, 0]]), images(4, seed)[[2, 0]])
+    assert store.read_irradiance()[8 + 2, 16 + 1].tolist() == [6.0, 7.0, 8.0]  # 17 = row 2, column 1
+    assert store.read_irradiance().sum() == np.arange(12).sum()
+
+
+def test_stock_zarr_python_reads_the_same_and_sees_absent_chunks(url: str) -> None:
+    fill(make(url))
+    group = zarr.open_group(str(folder(url)), mode="r")
+    rows, columns = 8 + COVERED // TILE, 16 + COVERED % TILE
+    for seed, name in enumerate(("light_field", "visibility")):
+        array = group[name]
+        assert isinstance(array, zarr.Array)
+        assert array.shards == (TILE, TILE, R, R, 3) and array.chunks == (1, 1, R, R, 3)
+        block = np.asarray(array[8:16, 16:24])
+        np.testing.assert_array_equal(block[COVERED // TILE, COVERED % TILE], images(4, seed))
+        assert np.count_nonzero(block.any(axis=(2, 3, 4))) == 3
+    # The shard's index (offset, length of each chunk, then its crc32c) lists the covered texels and no others.
+    data = (folder(url) / "light_field" / "c" / "1" / "2" / "0" / "0" / "0").read_bytes()
+    index = np.frombuffer(data[-(TILE * TILE * 16 + 4) : -4], "<u8").reshape(-1, 2)
+    assert np.flatnonzero(index[:, 0] != 2**64 - 1).tolist() == COVERED.tolist()
+    assert len(data) == 4 * (R * R * 6 + 4) + TILE * TILE * 16 + 4
+    irradiance = group["irradiance"]
+    assert isinstance(irradiance, zarr.Array)
+    assert np.asarray(irradiance[rows[3], columns[3]]).tolist() == [9.0, 10.0, 11.0]
+
+
+def test_attributes_and_texel_map_explain_the_store(url: str) -> None:
+    store = make(url)
+    rng = np.random.default_rng(1)
+    arrays = {
+        "position": rng.random((*SHAPE, 3), np.float32),
+        "normal": rng.random((*SHAPE, 3), np.float32),
+        "alpha": rng.random(SHAPE, np.float32),
+        "state": rng.integers(0, 3, SHAPE).astype(np.uint8),
+    }
+    store.write_texel_map(arrays)
+    group = zarr.open_group(str(folder(url)), mode="r")
+    assert group.attrs["scene_hash"] == "ab" * 32 and group.attrs["format_version"] == 1
+    conventions = group.attrs["conventions"]
+    assert isinstance(conventions, dict)
+    assert {"octahedral_map", "horizon", "exposure", "units"} <= set(conventions)
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(np.asarray(group[name]), values)
+        np.testing.assert_array_equal(LightFieldStore.open(url).read_texel_map()[name], values)
+
+
+def test_create_again_is_a_no_op_and_a_different_one_is_refused(url: str) -> None:
+    fill(make(url))
+    before = objects(url)
+    make(url)
+    assert objects(url) == before
+    with pytest.raises(Conflict, match="image_size"):
+        make(url, image_size=32)
+    with pytest.raises(Conflict, match="scene_hash"):
+        make(url, attributes={"scene_hash": "cd" * 32, "settings": {"preset": "draft"}})
+    assert objects(url) == before
+
+
+def test_a_rewritten_tile_is_the_same_bytes(url: str, tmp_path: Path) -> None:
+    fill(make(url))
+    once = objects(url)
+    fill(make(url))
+    assert objects(url) == once
+    other = f"file://{tmp_path}/other"
+    fill(make(other), seed=7)
+    fill(make(other))
+    assert objects(other) == once
+
+
+def test_missing_tile_store_and_function_are_errors(url: str) -> None:
+    with pytest.raises(NotFound, match="no light-field store"):
+        LightFieldStore.open(url)
+    store = make(url, functions=(Function.LIGHT_FIELD,))
+    with pytest.raises(NotFound, match="row 8, column 16"):
+        store.read_tile(Function.LIGHT_FIELD, PLACE, COVERED)
+    with pytest.raises(NotFound, match="no visibility"):
+        store.read_tile(Function.VISIBILITY, PLACE, COVERED)
+
+
+def test_damage_is_found_by_the_checksum(url: str) -> None:
+    store = make(url)
+    fill(store)
+    shard = folder(url) / "light_field" / "c" / "1" / "2" / "0" / "0" / "0"
+    data = bytearray(shard.read_bytes())
+    data[100] ^= 1
+    shard.write_bytes(data)
+    with pytest.raises(MachineLacks, match="damaged"):
+        LightFieldStore.open(url).read_tile(Function.LIGHT_FIELD, PLACE, COVERED)
+
+
+def test_values_that_are_not_finite_are_refused(url: str) -> None:
+    store = make(url, functions=(Function.LIGHT_FIELD,))
+    for bad in (np.inf, np.nan):
+        values = images(4)
+        values[2, 3, 4, 1] = bad
+        with pytest.raises(InternalError, match="1 values of light_field are not finite"):
+            store.write_tile(PLACE, COVERED, values, None, np.zeros((4, 3), np.float32))
+    assert not (folder(url) / "light_field" / "c").exists()
+
+
+@pytest.mark.parametrize("bad", ["/tmp/x", "http://host/x", "s3://", "file://host/x", "file://"])
+def test_places_that_are_none_are_refused(bad: str) -> None:
+    with pytest.raises(InputError, match="not a place for a store"):
+        LightFieldStore.open(bad)
+
+
+def test_full_disk_names_the_store_and_leaves_the_old_shard(url: str) -> None:
+    store = make(url)
+    fill(store)
+    before = objects(url)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, hard))
+    try:
+        with pytest.raises(MachineLacks, match="cannot take more data") as caught:
+            fill(store, seed=9)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert caught.value.where == url and "Free space" in (caught.value.remedy or "")
+    assert objects(url) == before
+
+
+_WRITER = """
+import sys, numpy as np
+from kiln_schemas.tasks import Tile
+from kiln_workers.store.light_field import LightFieldStore
+store = LightFieldStore.open(sys.argv[1])
+tile = Tile(row=0, column=0, size=store.tile_size, texels=64)
+covered = np.arange(64)
+print("ready", flush=True)
+value = 0
+while True:
+    value += 1
+    images = np.full((64, store.image_size, store.image_size, 3), value, np.float16)
+    store.write_tile(tile, covered, images, None, np.full((64, 3), value, np.float32))
+"""
+
+
+def test_killed_writers_leave_no_torn_shard(url: str) -> None:
+    make(url, image_size=64, functions=(Function.LIGHT_FIELD,))
+    tile = Tile(row=0, column=0, size=TILE, texels=64)
+    seen: set[float] = set()
+    for trial in range(6):
+        with subprocess.Popen([sys.executable, "-c", _WRITER, url], stdout=subprocess.PIPE) as writer:
+            assert writer.stdout is not None and writer.stdout.readline() == b"ready\n"
+            time.sleep(0.03 + 0.017 * trial)
+            writer.send_signal(signal.SIGKILL)
+        shard = folder(url) / "light_field" / "c" / "0" / "0" / "0" / "0" / "0"
+        if shard.exists():
+            values = LightFieldStore.open(url).read_tile(Function.LIGHT_FIELD, tile, np.arange(64))
+            assert values.min() == values.max() > 0  # one writer's whole tile, checksums right
+            seen.add(float(values.max()))
+    assert len(seen) > 1
+
+
+def test_a_real_s3_server(s3_server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in s3_server.environment().items():
+        monkeypatch.setenv(name, value)
+    url = f"s3://{s3_server.bucket}/bakes/one"
+    with pytest.raises(NotFound, match="no light-field store"):
+        LightFieldStore.open(url)
+    fill(make(url))
+    fill(make(url))
+    store = LightFieldStore.open(url)
+    np.testing.assert_array_equal(store.read_tile(Function.VISIBILITY, PLACE, COVERED), images(4, 1))
+    with pytest.raises(NotFound, match="row 0, column 0"):
+        store.read_tile(Function.VISIBILITY, Tile(row=0, column=0, size=TILE, texels=4), COVERED)
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
+    with pytest.raises(MachineLacks, match="refuses access"):
+        LightFieldStore.open(url)
+
+
+def test_the_group_document_is_json_with_sorted_keys(url: str) -> None:
+    make(url)
+    text = (folder(url) / "zarr.json").read_text()
+    assert json.dumps(json.loads(text), indent=1, sort_keys=True) == text
+    assert not list(folder(url).rglob("*__lock"))
