@@ -37,7 +37,7 @@ def test_memory_order_and_composition_change_nothing(
     cornell: Callable[..., Scene], spots: TexelBatch, renderer: Callable[..., TileRenderer], sky: Environment
 ) -> None:
     scene = cornell(sky)
-    settings = {"image_size": 32, "samples": 4, "irradiance_samples": 40}
+    settings = {"image_size": 64, "samples": 2, "irradiance_samples": 40}
     whole = renderer(scene, **settings).render(spots)
     small = renderer(scene, memory=BYTES_PER_LANE * SMALLEST_WAVEFRONT, **settings)
     assert small.wavefront == SMALLEST_WAVEFRONT

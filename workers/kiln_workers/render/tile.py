@@ -110,7 +110,7 @@ class TileRenderer:
         out = np.zeros((len(texels), size * size, 3), np.float16)
         back, paths = np.zeros(len(texels), np.int64), np.zeros(len(texels), np.int64)
         overflows = 0
-        for part, fraction in self._wavefronts(lanes_above_horizon(texels.normal, size)):
+        for part, fraction in self._pixel_wavefronts(texels):
             texel, pixel = part[:, 0], part[:, 1]
             sums = self._trace_pixels(texels, texel, pixel, samples)
             mean = np.array(sums.radiance).T / np.maximum(np.array(sums.weight), 1e-30)[:, None]
@@ -209,6 +209,18 @@ class TileRenderer:
             out[lanes[:, 0] + first, lanes[:, 1]] = values.astype(np.float16)
             on_progress(min(first + group, len(texels)) / len(texels))
         return out.reshape(len(texels), size, size, 3)
+
+    def _pixel_wavefronts(self, texels: TexelBatch) -> Iterator[tuple[Int64, float]]:
+        """Wavefronts (texel, pixel) [L, 2] of all pixels above the horizon, and the fraction done after each."""
+        size = self.settings.image_size
+        # About half of the pixels are above, so this many texels fill a wavefront.
+        group = max(1, 2 * self.wavefront // (size * size))
+        for first in range(0, len(texels), group):
+            normals = texels.normal[first : first + group]
+            lanes = lanes_above_horizon(normals, size)
+            lanes[:, 0] += first
+            for part, fraction in self._wavefronts(lanes):
+                yield part, (first + fraction * len(normals)) / len(texels)
 
     def _wavefronts(self, lanes: Int64) -> Iterator[tuple[Int64, float]]:
         for first in range(0, len(lanes), self.wavefront):
