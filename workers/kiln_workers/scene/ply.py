@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from trimesh.exchange.ply import load_ply
+from trimesh.geometry import triangulate_quads
 
 from kiln_schemas.errors import InputError
 from kiln_workers.scene.bundle import BundleFolder
@@ -27,21 +28,20 @@ def parse_ply(data: bytes, where: str, material: int = 0) -> RawMesh:
     """The mesh of a PLY file; InputError names `where` if it cannot be read."""
     try:
         parsed = load_ply(io.BytesIO(data), skip_materials=True)
+        faces = np.asarray(triangulate_quads(parsed.get("faces", [])), dtype=np.int64).reshape(-1, 3)
     except Exception as error:  # trimesh raises whatever its parsing meets, on a file that is not PLY
         raise InputError(
             f"cannot be read as PLY ({type(error).__name__}: {error})", where=where, remedy="Export it again."
         ) from None
     positions = np.asarray(parsed.get("vertices", np.zeros((0, 3))), dtype=np.float64).reshape(-1, 3)
-    faces = parsed.get("faces")
-    triangles = np.zeros((0, 3), np.int64) if faces is None else np.asarray(faces, dtype=np.int64).reshape(-1, 3)
-    check_triangle_count(len(triangles), where)
+    check_triangle_count(len(faces), where)
     vertex = parsed.get("metadata", {}).get("_ply_raw", {}).get("vertex", {}).get("data")
     uv = _columns(vertex, ("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
     normals = _columns(vertex, ("nx", "ny", "nz"))
     return RawMesh(
         name=Path(where).stem,
         positions=positions,
-        faces=triangles,
+        faces=faces,
         material=material,
         normals=normals if normals is not None and len(normals) == len(positions) else None,
         uv=uv * [1.0, -1.0] + [0.0, 1.0] if uv is not None and len(uv) == len(positions) else None,
