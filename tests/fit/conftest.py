@@ -1,0 +1,37 @@
+"""Small light fields made of true lobes: two moving lights over a floor and a wall."""
+
+import numpy as np
+import pytest
+
+from kiln_workers.fit.source import ArraySource
+from kiln_workers.sphere import gaussian, octahedral
+
+SIZE = 16
+
+
+def made_of_lobes(texels: int, size: int = SIZE) -> tuple[np.ndarray, np.ndarray]:
+    """Images [T, R, R, 3] float16, black below the horizon, and normals [T, 3]; neighbours differ a little."""
+    t = np.linspace(0.0, 1.0, texels)[:, None]
+    normals = np.where(np.arange(texels)[:, None] % 2 == 0, [0.0, 1.0, 0.0], [0.0, 0.6, 0.8])
+
+    def moving(start: list[float], end: list[float], sharpness: float, amplitude: list[float]) -> np.ndarray:
+        axis = np.array(start) * (1.0 - t) + np.array(end) * t
+        axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+        return np.concatenate([axis, np.full_like(t, sharpness), np.tile(amplitude, (texels, 1))], axis=1)
+
+    lobes = np.stack(
+        [
+            moving([1.0, 0.8, 0.3], [0.2, 1.0, 0.9], 20.0, [9.0, 6.0, 2.0]),
+            moving([-0.6, 1.0, 0.5], [-0.9, 0.6, 0.9], 4.0, [0.3, 0.5, 1.0]),
+        ],
+        axis=1,
+    )
+    directions = octahedral.pixel_directions(size).reshape(-1, 3)
+    above = normals @ directions.T > 0.0
+    images = gaussian.evaluate(directions, lobes) * above[..., None]
+    return images.reshape(texels, size, size, 3).astype(np.float16), normals.astype(np.float32)
+
+
+@pytest.fixture
+def lobe_source() -> ArraySource:
+    return ArraySource(*made_of_lobes(40), tile=16)
