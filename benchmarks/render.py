@@ -159,12 +159,15 @@ def main() -> None:
         "40 spheres, lamp": cornell(40, 25),
         "40 spheres, sky": cornell(40, 25, sky=True),
     }
-    rows = [measure(name, scene, settings, options.texels) for name, scene in scenes.items()]
     print(f"{'scene':<18}{'triangles':>10}{'M paths/s':>11}{'mi path':>9}{'ratio':>7}{'ms/texel, all':>15}")
-    for row in rows:
+    rows = []
+    for name, scene in scenes.items():
+        row = measure(name, scene, settings, options.texels)
+        rows.append(row)
         print(
-            f"{row['scene']:<18}{row['triangles']:>10}{row['light_field_paths_per_s'] / 1e6:>11.2f}"
-            f"{row['mitsuba_path_paths_per_s'] / 1e6:>9.2f}{row['ratio']:>7.2f}{row['ms_per_texel_all_images']:>15.2f}"
+            f"{name:<18}{row['triangles']:>10}{row['light_field_paths_per_s'] / 1e6:>11.2f}"
+            f"{row['mitsuba_path_paths_per_s'] / 1e6:>9.2f}{row['ratio']:>7.2f}{row['ms_per_texel_all_images']:>15.2f}",
+            flush=True,
         )
     print(f"memory: {memory:.0f} bytes per lane of a wavefront")
     if options.json:
