@@ -6,7 +6,7 @@ import pytest
 from kiln_schemas.errors import InputError, TooLarge
 from kiln_schemas.tasks import EnvironmentRef
 from kiln_workers.scene.environment import (
-    MAX_WIDTH,
+    averaged_down,
     checked_environment,
     load_environment,
     read_environment,
@@ -75,15 +75,26 @@ def test_images_beyond_the_bound_are_refused(tmp_path, write_image):
         decode_image(path.read_bytes(), "wide.png")
 
 
-@pytest.mark.parametrize("width", [4100, 4608])
+@pytest.mark.parametrize("width", [66, 130, 256])
 def test_averaging_down_keeps_the_light(width):
     rng = np.random.default_rng(1)
     pixels = rng.gamma(0.3, 1.0, (width // 2, width, 3)).astype(np.float32)
-    small, notes = checked_environment(pixels, "big.exr")
-    assert small.shape == (MAX_WIDTH // 2, MAX_WIDTH, 3) and "averaged down" in notes[0]
+    small = averaged_down(pixels, 64)
+    assert small.shape == (32, 64, 3)
     flux = [np.einsum("hwc,h->c", p, row_solid_angles(len(p))) / p.shape[1] for p in (pixels, small)]
     np.testing.assert_allclose(flux[1], flux[0], rtol=1e-5)
     assert small[0, :, 0].std() > 0.0
+    if width == 256:  # a whole factor: each pixel is the weighted mean of its block
+        weight = row_solid_angles(128)[:4, None, None]
+        block = (pixels[:4, :4] * weight).sum(axis=(0, 1)) / (4 * weight.sum())
+        np.testing.assert_allclose(small[0, 0], block, rtol=1e-5)
+
+
+def test_only_images_beyond_the_bound_are_averaged_down(monkeypatch):
+    monkeypatch.setattr("kiln_workers.scene.environment.MAX_WIDTH", 64)
+    for width, notes in ((64, 0), (128, 1)):
+        pixels, said = checked_environment(np.ones((width // 2, width, 3), np.float32), "sky.exr")
+        assert pixels.shape == (32, 64, 3) and len(said) == notes
 
 
 def test_the_sky_has_the_irradiance_that_was_asked_for():

@@ -26,7 +26,7 @@ from kiln_workers.scene.unwrap import Unwrapped, cut_into_charts
 
 UV_TOLERANCE: Final = 1e-4
 OVERSAMPLING: Final = 4
-SAMPLES: Final = (512, 4096)
+SAMPLES: Final = (256, 4096)
 """Bounds of the overlap test's grid side."""
 OVERLAP_TEXELS: Final = 1.0
 FLAT_SHARE: Final = 1e-3
@@ -96,12 +96,10 @@ def _overlaps(meshes: Sequence[Mesh], resolution: int) -> list[Fault]:
         taken = owner[sample] >= 0
         previous = np.where(taken, owner[sample], np.concatenate([face[:1], face[:-1]]))
         clash = repeated | taken
-        pairs, counts = np.unique(
-            np.stack([mesh_of[previous[clash]], mesh_of[face[clash]]], axis=1), axis=0, return_counts=True
-        )
-        for (a, b), count in zip(pairs, counts, strict=True):
-            key = (int(min(a, b)), int(max(a, b)))
-            shared[key] = shared.get(key, 0) + int(count)
+        pairs, counts = np.unique(mesh_of[previous[clash]] * len(meshes) + mesh_of[face[clash]], return_counts=True)
+        for pair, count in zip(pairs.tolist(), counts.tolist(), strict=True):
+            a, b = sorted(divmod(pair, len(meshes)))
+            shared[a, b] = shared.get((a, b), 0) + count
         owner[sample[~clash]] = face[~clash]
     texels = {key: count * (resolution / size) ** 2 for key, count in shared.items()}
     if sum(texels.values()) <= OVERLAP_TEXELS:

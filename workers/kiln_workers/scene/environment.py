@@ -8,12 +8,12 @@ solid angles, so the light that arrives stays the same.
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_array
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.tasks import EnvironmentRef
 from kiln_workers.scene.bundle import BundleFolder
+from kiln_workers.scene.geometry import Floats
 from kiln_workers.scene.images import HDR_FORMATS, decode_image, image_format
 from kiln_workers.scene.model import Environment, Float32
 
@@ -63,33 +63,30 @@ def checked_environment(pixels: Float32, name: str) -> tuple[Float32, list[str]]
     if width <= MAX_WIDTH:
         return np.ascontiguousarray(pixels), []
     note = f"Environment '{name}': averaged down from {width} to {MAX_WIDTH} pixels wide."
-    return _box_down(pixels, MAX_WIDTH), [note]
+    return averaged_down(pixels, MAX_WIDTH), [note]
 
 
-def row_solid_angles(height: int) -> npt.NDArray[np.float64]:
+def row_solid_angles(height: int) -> Floats:
     """Solid angles [H] of a whole row of an equirectangular image, in steradians; they sum to 4 pi."""
     return np.asarray(2.0 * np.pi * -np.diff(np.cos(np.linspace(0.0, np.pi, height + 1))))
 
 
-def _box_down(pixels: Float32, width: int) -> Float32:
-    # Rows near the poles cover less of the sphere: weight them, so that the sum over solid angle is kept.
-    angles = row_solid_angles(pixels.shape[0])
-    rows, columns = _box_matrix(pixels.shape[0], width // 2), _box_matrix(pixels.shape[1], width)
-    total = rows @ angles
-    channels = []
-    for channel in range(3):
-        weighted = rows @ (pixels[..., channel] * angles[:, None]) / total[:, None]
-        channels.append((columns @ weighted.T).T)
-    return np.stack(channels, axis=-1).astype(np.float32)
+def averaged_down(pixels: Float32, width: int) -> Float32:
+    """The image [H, W, 3] as [width / 2, width, 3] by box filters; the light from every part of the sphere is kept."""
+    # Rows are weighted by the solid angle that they share, so the parts near the poles count less.
+    height = pixels.shape[0]
+    rows = _overlaps(-np.cos(np.linspace(0.0, np.pi, height + 1)), -np.cos(np.linspace(0.0, np.pi, width // 2 + 1)))
+    columns = _overlaps(np.linspace(0.0, 1.0, pixels.shape[1] + 1), np.linspace(0.0, 1.0, width + 1))
+    channels = [columns @ (rows @ pixels[..., channel]).T for channel in range(3)]
+    return np.stack([channel.T for channel in channels], axis=-1).astype(np.float32)
 
 
-def _box_matrix(source: int, target: int) -> csr_array:
-    """[target, source]: the part of each source pixel in each target pixel; rows sum to 1."""
-    pixel = np.arange(source)
-    ratio = target / source
-    first = np.minimum((pixel * ratio).astype(np.int64), target - 1)
-    border = np.clip((first + 1) / ratio - pixel, 0.0, 1.0)  # the part of the pixel before the next target's border
-    second = np.minimum(first + 1, target - 1)
-    values = np.concatenate([border, 1.0 - border]) * ratio
-    places = (np.concatenate([first, second]), np.concatenate([pixel, pixel]))
-    return csr_array((values, places), shape=(target, source))
+def _overlaps(source: Floats, target: Floats) -> csr_array:
+    """[T, S]: the part of each of T intervals that each of S >= T finer ones covers; from rising edges, rows sum to 1."""
+    low, high = source[:-1], source[1:]
+    first = np.clip(np.searchsorted(target, low, side="right") - 1, 0, len(target) - 2)
+    inside = np.minimum(high, target[first + 1]) - low
+    second = np.minimum(first + 1, len(target) - 2)
+    values = np.concatenate([inside, high - low - inside])
+    rows, places = np.concatenate([first, second]), np.tile(np.arange(len(low)), 2)
+    return csr_array((values / np.diff(target)[rows], (rows, places)), shape=(len(target) - 1, len(low)))
