@@ -82,7 +82,7 @@ def averaged_down(pixels: Float32, width: int) -> Float32:
 
 
 def _overlaps(source: Floats, target: Floats) -> csr_array:
-    """[T, S]: the part of each of T intervals that each of S >= T finer ones covers; from rising edges, rows sum to 1."""
+    """[T, S]: the part of each of T intervals that each of S >= T finer ones covers; rows sum to 1, edges rise."""
     low, high = source[:-1], source[1:]
     first = np.clip(np.searchsorted(target, low, side="right") - 1, 0, len(target) - 2)
     inside = np.minimum(high, target[first + 1]) - low
