@@ -67,6 +67,7 @@ class FitSettings(Contract):
     batch: int = Field(default=32, ge=1, le=1024, description="texels per step")
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
     window: int = Field(default=2048, ge=1, le=1_000_000, description="texels in the shuffle window")
+    checkpoint_s: float = Field(default=60.0, ge=1.0, le=3600.0, description="seconds between checkpoints")
 
 
 class PackageSettings(Contract):

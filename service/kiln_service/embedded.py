@@ -160,15 +160,20 @@ class EmbeddedPostgres:
         draft.rename(self.folder)
 
     def _stop_leftover(self) -> None:
-        """Stop the server of a coordinator that was killed, and drop a lock file that no server holds."""
-        pid_file = self.folder / "postmaster.pid"
+        """Stop the server of a coordinator that was killed, and drop lock files that no server holds.
+
+        A stopping server removes its two lock files one after the other before its process ends: look at both.
+        """
+        lock_files = (self.folder / "postmaster.pid", self._sockets / ".s.PGSQL.5432.lock")
         deadline = time.monotonic() + STOP_TIMEOUT_S
-        while (pid := _read_pid(pid_file)) is not None and _is_postgres(pid):
-            log.info("stopping the embedded database (pid %d) that an earlier coordinator left", pid)
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGINT if time.monotonic() < deadline else signal.SIGKILL)
+        while running := {pid for file in lock_files if (pid := _read_pid(file)) is not None and _is_postgres(pid)}:
+            for pid in running:
+                log.info("stopping the embedded database (pid %d) that an earlier coordinator left", pid)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGINT if time.monotonic() < deadline else signal.SIGKILL)
             time.sleep(0.1)
-        pid_file.unlink(missing_ok=True)
+        for file in lock_files:
+            file.unlink(missing_ok=True)
 
     def _wait_until_ready(self) -> None:
         deadline = time.monotonic() + START_TIMEOUT_S

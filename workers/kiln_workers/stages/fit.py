@@ -16,6 +16,9 @@ def run(payload: FitPayload, context: Context) -> FitResult:
     store = LightFieldStore.open(payload.store_url)
     source = StoreSource(store, payload.function, texel_map.state, texel_map.normal, tiles)
 
+    checkpoint = context.last_checkpoint()
+    context.log(f"{payload.function.value}: {'going on from a checkpoint' if checkpoint else 'starting'}")
+
     def on_progress(at: Progress) -> None:
         context.progress(at.done, at.total, at.unit, at.message, at.loss)
 
@@ -25,9 +28,10 @@ def run(payload: FitPayload, context: Context) -> FitResult:
         payload.function,
         payload.settings.seed,
         threads=context.threads,
-        checkpoint=context.last_checkpoint(),
+        checkpoint=checkpoint,
         on_checkpoint=context.checkpoint,
         on_progress=on_progress,
+        checkpoint_every_s=payload.settings.fit.checkpoint_s,
     )
     context.log(f"{payload.function.value}: log_mse_rel {outcome.metrics.log_mse_rel:.4f}")
     return FitResult(

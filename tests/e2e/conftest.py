@@ -1,0 +1,50 @@
+"""Fixtures of the end-to-end tests: the room's files, and a farm with a coordinator.
+
+Data folders lie outside pytest's own temporary folder: every start of pytest as root makes that one private, which
+would lock the embedded database of a run that goes on at the same time out of its files.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from e2e_farm import Farm, room, sky
+
+from kiln_workers.package.glb import encode_glb
+from kiln_workers.scene.examples import write_exr
+
+
+@pytest.fixture(scope="session")
+def room_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The room as GLB and its sky as EXR."""
+    folder = tmp_path_factory.mktemp("room")
+    (folder / "room.glb").write_bytes(encode_glb(room()))
+    write_exr(folder / "sky.exr", sky())
+    return folder / "room.glb", folder / "sky.exr"
+
+
+@pytest.fixture(scope="session")
+def session_folder() -> Iterator[Path]:
+    """A folder for the whole run."""
+    with tempfile.TemporaryDirectory(prefix="lightkiln-e2e-") as folder:
+        yield Path(folder)
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A folder for one test."""
+    with tempfile.TemporaryDirectory(prefix="lightkiln-e2e-") as folder:
+        yield Path(folder)
+
+
+@pytest.fixture(scope="session")
+def farm(session_folder: Path) -> Iterator[Farm]:
+    """A coordinator without workers."""
+    farm = Farm(session_folder / "farm")
+    farm.folder.mkdir()
+    try:
+        farm.start_coordinator()
+        yield farm
+    finally:
+        farm.stop()
