@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+
 from kiln_schemas.settings import Function, make_settings
 from kiln_schemas.tasks import (
     Bundle,

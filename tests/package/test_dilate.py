@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from kiln_schemas.errors import InternalError
 from kiln_workers.package.dilate import SHARP_RINGS, plan_fill
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from kiln_schemas.errors import InternalError
 from kiln_workers.package.colour import quantise, srgb_encode
 from kiln_workers.package.glb import encode_glb, encode_image

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from kiln_schemas.errors import InternalError
 from kiln_workers.package.half import as_stored, layers_to_lobes, lobes_to_layers, to_half
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from kiln_schemas.errors import InputError, InternalError
 from kiln_workers.package import ktx2
 from kiln_workers.package.ktx2_validate import validate

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+
 from kiln_schemas.errors import InternalError
 from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import Function

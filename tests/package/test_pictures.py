@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+
 from kiln_schemas.errors import InternalError, MachineLacks
 from kiln_workers.package import colour, exr, files, png
 

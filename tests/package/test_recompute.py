@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+
 from kiln_schemas.settings import Function
 from kiln_workers.package.build import build_package
 from kiln_workers.sphere import octahedral

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import CurvePoint
 from kiln_workers.package import charts, report

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+
 from kiln_workers.package import shaders
 
 

@@ -12,8 +12,9 @@ from typing import Final
 
 import numpy as np
 import torch
-from kiln_schemas.conventions import LOBE_PARAMETERS
 from torch import Tensor
+
+from kiln_schemas.conventions import LOBE_PARAMETERS
 
 LOG_SHARPNESS: Final = (math.log(0.25), math.log(3000.0))
 """Range of log lambda: from nearly constant to one pixel of a 128 x 128 image; well inside fp16."""

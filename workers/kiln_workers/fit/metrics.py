@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import torch
+
 from kiln_schemas.conventions import EXPOSURE_KEY
 from kiln_schemas.settings import Function
-
 from kiln_workers.fit.loss import lobe_values
 from kiln_workers.fit.network import pixel_centres, solid_angles
 from kiln_workers.fit.source import Float16, Float32, TexelSource

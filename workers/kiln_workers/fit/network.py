@@ -13,10 +13,10 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from kiln_schemas.conventions import LOBE_PARAMETERS
 from torch import Tensor
 from torch.nn import functional
 
+from kiln_schemas.conventions import LOBE_PARAMETERS
 from kiln_workers.fit.lobes import constrain
 from kiln_workers.sphere import octahedral
 

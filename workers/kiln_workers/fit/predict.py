@@ -11,10 +11,10 @@ from typing import Any, Final, Self
 
 import numpy as np
 import torch
-from kiln_schemas.conventions import FORMAT_VERSION, FP16_MAX
-from kiln_schemas.errors import InputError
 from torch import Tensor
 
+from kiln_schemas.conventions import FORMAT_VERSION, FP16_MAX
+from kiln_schemas.errors import InputError
 from kiln_workers.fit.network import Shape, lobes, split
 from kiln_workers.fit.source import Float16, Float32
 from kiln_workers.fit.threads import single_threaded_pool

@@ -5,9 +5,9 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
-
 from kiln_workers.store.light_field import LightFieldStore
 
 Float16 = npt.NDArray[np.float16]

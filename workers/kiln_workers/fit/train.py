@@ -16,12 +16,12 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
+
 from kiln_schemas.conventions import LOBE_PARAMETERS
 from kiln_schemas.errors import FitFailed, InputError
 from kiln_schemas.settings import FitSettings, Function
 from kiln_schemas.tasks import CurvePoint, FitMetrics, Progress
-from torch import Tensor
-
 from kiln_workers.fit.lobes import constrain
 from kiln_workers.fit.loss import Sample, draw_sample, log_loss, sample_weights
 from kiln_workers.fit.metrics import TexelErrors, exposure_of, texel_errors

@@ -11,6 +11,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
+
 from kiln_schemas import __version__
 from kiln_schemas.conventions import (
     ENVIRONMENT_GGX_KTX2,
@@ -28,7 +29,6 @@ from kiln_schemas.errors import InternalError
 from kiln_schemas.manifest import Manifest, ManifestMetrics
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Artifact, FitMetrics, PackagePayload
-
 from kiln_workers.package import exr, ktx2, report, shaders
 from kiln_workers.package.dilate import Fill, plan_fill
 from kiln_workers.package.files import artifact, write_bytes

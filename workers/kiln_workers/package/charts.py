@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from kiln_schemas.tasks import CurvePoint
 from markupsafe import Markup
 
+from kiln_schemas.tasks import CurvePoint
 from kiln_workers.package import png
 from kiln_workers.package.colour import viridis
 

@@ -14,8 +14,9 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from kiln_schemas.errors import InternalError
 from scipy.ndimage import distance_transform_edt, find_objects
+
+from kiln_schemas.errors import InternalError
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]

@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import OpenEXR
+
 from kiln_schemas import __version__
 from kiln_schemas.errors import InternalError
-
 from kiln_workers.package.files import write_bytes
 
 Float32 = npt.NDArray[np.float32]

@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import pygltflib as gltf
+
 from kiln_schemas import __version__
 from kiln_schemas.errors import InternalError
-
 from kiln_workers.package import png
 from kiln_workers.package.colour import quantise, srgb_decode, srgb_encode
 from kiln_workers.scene.model import Image, LightKind, Material, Mesh, PunctualLight, Scene, TextureRef

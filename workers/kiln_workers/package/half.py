@@ -7,6 +7,7 @@ half an fp16 step (2^-12 relative) of unit length; what does not fit the fp16 ra
 
 import numpy as np
 import numpy.typing as npt
+
 from kiln_schemas.conventions import FP16_MAX, LAYERS_PER_LOBE, LOBE_PARAMETERS
 from kiln_schemas.errors import InternalError
 

@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import zstandard
+
 from kiln_schemas import __version__
 from kiln_schemas.errors import InputError, InternalError
-
 from kiln_workers.package.files import write_bytes
 from kiln_workers.package.ktx2_validate import validate
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+
 from kiln_schemas.errors import InternalError
 from kiln_schemas.settings import Function
 

@@ -12,10 +12,10 @@ from typing import Any, Final
 import jinja2
 import numpy as np
 import numpy.typing as npt
+
 from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Artifact, FitMetrics, FitResult
-
 from kiln_workers.package import charts, colour
 from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelPreview
 from kiln_workers.sphere import octahedral

@@ -12,13 +12,12 @@ from typing import Final
 import numpy as np
 import OpenEXR
 
+from kiln_workers.package.glb import encode_glb
 from kiln_workers.scene.geometry import Floats
-from kiln_workers.scene.glb_writer import glb_bytes
 from kiln_workers.scene.model import Environment, Float32, Material, Mesh, Scene
 from kiln_workers.scene.shapes import Cell, arc, column, patch, quad, sphere, trefoil, tube
 from kiln_workers.scene.sky import clear_sky
 
-GENERATOR: Final = "lightkiln examples"
 ALPHAS: Final = (0.2, 0.3, 0.4, 0.5)
 """GGX alpha of the four sets; glTF's roughness is its square root."""
 
@@ -29,8 +28,8 @@ def write_examples(folder: Path) -> list[Path]:
     courtyard = courtyard_scene()
     assert courtyard.environment is not None
     paths = [folder / "gallery.glb", folder / "courtyard.glb", folder / "courtyard.exr"]
-    paths[0].write_bytes(glb_bytes(gallery_scene(), GENERATOR))
-    paths[1].write_bytes(glb_bytes(courtyard, GENERATOR))
+    paths[0].write_bytes(encode_glb(gallery_scene()))
+    paths[1].write_bytes(encode_glb(courtyard))
     write_exr(paths[2], courtyard.environment.pixels)
     return paths
 

@@ -13,11 +13,11 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 import tensorstore as ts
+
 from kiln_schemas import conventions
 from kiln_schemas.errors import Conflict, InputError, InternalError, NotFound
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
-
 from kiln_workers.store import layout
 from kiln_workers.store.location import kvstore_spec, translated_errors
 
