@@ -1,0 +1,190 @@
+"""The four stages in one process, on a room: what the package's textures hold is what the networks gave."""
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from e2e_farm import TINY, room, sky
+
+from kiln_schemas.errors import Canceled, InputError
+from kiln_schemas.settings import Function, make_settings
+from kiln_schemas.tasks import (
+    Bundle,
+    EnvironmentRef,
+    FitPayload,
+    FitResult,
+    PackagePayload,
+    PackageResult,
+    PreparePayload,
+    PrepareResult,
+    RenderPayload,
+    RenderResult,
+)
+from kiln_workers.fit.predict import Weights, predict
+from kiln_workers.package import ktx2
+from kiln_workers.package.glb import encode_glb
+from kiln_workers.package.half import layers_to_lobes
+from kiln_workers.scene.examples import write_exr
+from kiln_workers.scene.texel_map import TexelState, unpack_texel_map
+from kiln_workers.stages import fit, package, prepare, render
+from kiln_workers.stages.tiles import covered_texels, map_coordinates, plan_tiles, with_render_verdict
+from kiln_workers.store.light_field import LightFieldStore
+
+
+@dataclass
+class MemoryContext:
+    """A `runner.context.Context` without a coordinator."""
+
+    scratch: Path
+    blobs: dict[str, bytes] = field(default_factory=dict)
+    cache: dict[str, Any] = field(default_factory=dict)
+    memory_bytes: int = 1 << 30
+    threads: int = 2
+    canceled: bool = False
+    messages: list[str] = field(default_factory=list)
+
+    def blob(self, sha256: str) -> bytes:
+        return self.blobs[sha256]
+
+    def blob_path(self, sha256: str) -> Path:
+        path = self.scratch / sha256
+        path.write_bytes(self.blobs[sha256])
+        return path
+
+    def put_blob(self, data: bytes | Path) -> str:
+        content = data if isinstance(data, bytes) else data.read_bytes()
+        sha256 = hashlib.sha256(content).hexdigest()
+        self.blobs[sha256] = content
+        return sha256
+
+    def progress(self, done: float, total: float, unit: str, message: str = "", loss: float | None = None) -> None:
+        assert 0 <= done <= total
+        if self.canceled:
+            raise Canceled("the task is no longer wanted")
+
+    def checkpoint(self, data: bytes) -> None:
+        self.put_blob(data)
+
+    def last_checkpoint(self) -> bytes | None:
+        return None
+
+    def log(self, text: str) -> None:
+        self.messages.append(text)
+
+
+@dataclass(frozen=True)
+class Baked:
+    """Everything that one bake handed on."""
+
+    context: MemoryContext
+    prepare_payload: PreparePayload
+    prepared: PrepareResult
+    renders: tuple[RenderResult, ...]
+    fits: tuple[FitResult, ...]
+    packaged: PackageResult
+
+    def artifact(self, name: str) -> bytes:
+        (found,) = (a for a in self.packaged.artifacts if a.name == name)
+        return self.context.blobs[found.sha256]
+
+    def render_payload(self, index: int) -> RenderPayload:
+        return RenderPayload(
+            scene=self.prepared.scene,
+            texel_map=self.prepared.texel_map,
+            tile=self.prepared.tiles[index],
+            settings=self.prepare_payload.settings,
+            store_url=self.prepare_payload.store_url,
+        )
+
+
+@pytest.fixture(scope="module")
+def baked(tmp_path_factory: pytest.TempPathFactory) -> Baked:
+    folder = tmp_path_factory.mktemp("stages")
+    context = MemoryContext(scratch=folder / "scratch")
+    context.scratch.mkdir()
+    write_exr(folder / "sky.exr", sky())
+    files = {"room.glb": context.put_blob(encode_glb(room())), "sky.exr": context.put_blob(folder / "sky.exr")}
+    bundle = Bundle(entry="room.glb", files=files, environment=EnvironmentRef(file="sky.exr"))
+    settings = make_settings("draft", TINY)
+    url = f"file://{folder}/store.zarr"
+    asked = PreparePayload(bundle=bundle, settings=settings, store_url=url)
+    prepared = prepare.run(asked, context)
+    common: dict[str, Any] = {"settings": settings, "store_url": url}
+    renders = tuple(
+        render.run(
+            RenderPayload(scene=prepared.scene, texel_map=prepared.texel_map, tile=tile, **common),
+            context,
+        )
+        for tile in prepared.tiles
+    )
+    fits = tuple(
+        fit.run(FitPayload(function=f, texel_map=prepared.texel_map, renders=renders, **common), context)
+        for f in Function
+    )
+    packaged = package.run(
+        PackagePayload(
+            job_id="j", job_name="room", bundle=bundle, prepare=prepared, renders=renders, fits=fits, **common
+        ),
+        context,
+    )
+    return Baked(context, asked, prepared, renders, fits, packaged)
+
+
+@pytest.mark.parametrize("function", list(Function))
+def test_texture_holds_the_networks_output(baked: Baked, function: Function) -> None:
+    """At every valid texel the stored lobes are the network's, up to fp16: axes, sharpness and amplitude."""
+    fitted = next(f for f in baked.fits if f.function is function)
+    name = {Function.LIGHT_FIELD: "lightfield.ktx2", Function.VISIBILITY: "visibility.ktx2"}[function]
+    stored = layers_to_lobes(ktx2.decode(baked.artifact(name)).levels[0][:, 0])
+    texel_map = with_render_verdict(unpack_texel_map(baked.context.blob(baked.prepared.texel_map)), baked.renders)
+    store = LightFieldStore.open(baked.prepare_payload.store_url)
+    compared = 0
+    for tile in baked.prepared.tiles:
+        inside = covered_texels(texel_map, tile)
+        place = map_coordinates(tile, inside)
+        valid = texel_map.state[place] == TexelState.VALID
+        inside, place = inside[valid], (place[0][valid], place[1][valid])
+        images = store.read_tile(function, tile, inside)
+        expected = predict(Weights.from_bytes(baked.context.blob(fitted.weights)), images, texel_map.normal[place])
+        np.testing.assert_allclose(stored[place], expected, rtol=2.0**-10, atol=2.0**-11)
+        compared += len(inside)
+    assert compared == fitted.metrics.texels > 50
+
+
+def test_rendering_a_tile_again_gives_the_same_result(baked: Baked) -> None:
+    """Also from a cold start and with another memory bound."""
+    store = LightFieldStore.open(baked.prepare_payload.store_url)
+    tile = baked.prepared.tiles[0]
+    inside = covered_texels(unpack_texel_map(baked.context.blob(baked.prepared.texel_map)), tile)
+    before = [store.read_tile(function, tile, inside).tobytes() for function in Function]
+    cold = MemoryContext(scratch=baked.context.scratch, blobs=baked.context.blobs, memory_bytes=1 << 22)
+    again = render.run(baked.render_payload(0), cold)
+    assert again.model_copy(update={"seconds": 0.0}) == baked.renders[0].model_copy(update={"seconds": 0.0})
+    assert [store.read_tile(function, tile, inside).tobytes() for function in Function] == before
+
+
+def test_every_texel_is_in_one_tile(baked: Baked) -> None:
+    texel_map = unpack_texel_map(baked.context.blob(baked.prepared.texel_map))
+    count = np.zeros(texel_map.state.shape, int)
+    for tile in plan_tiles(texel_map, 8):
+        inside = covered_texels(texel_map, tile)
+        assert len(inside) == tile.texels
+        count[map_coordinates(tile, inside)] += 1
+    np.testing.assert_array_equal(count, texel_map.state != TexelState.GUTTER)
+
+
+def test_a_canceled_stage_stops(baked: Baked) -> None:
+    context = MemoryContext(scratch=baked.context.scratch, blobs=baked.context.blobs, canceled=True)
+    with pytest.raises(Canceled):
+        render.run(baked.render_payload(0), context)
+
+
+def test_a_dark_scene_is_refused(baked: Baked) -> None:
+    """No lamp and no environment: there is no light to bake, and the sentence says so."""
+    context = MemoryContext(scratch=baked.context.scratch)
+    bundle = Bundle(entry="dark.glb", files={"dark.glb": context.put_blob(encode_glb(room(lamp=0.0)))})
+    with pytest.raises(InputError, match="light"):
+        prepare.run(baked.prepare_payload.model_copy(update={"bundle": bundle}), context)
