@@ -6,7 +6,7 @@ from pydantic import Field
 
 from kiln_schemas.base import Contract
 from kiln_schemas.settings import BakeSettings
-from kiln_schemas.tasks import Artifact, FitMetrics, Sha256
+from kiln_schemas.tasks import Artifact, EnvironmentRef, FitMetrics, Sha256
 
 
 class ManifestMetrics(Contract):
@@ -27,6 +27,8 @@ class Manifest(Contract):
     scene_hash: Sha256
     inputs: dict[str, Sha256]
     """The bundle's files."""
+    environment: EnvironmentRef | None
+    """Which of them is the distant illumination, its scale and rotation."""
     seeds: dict[str, int]
     exposure: dict[str, float]
     """Factor per function by which radiance was multiplied before the loss; amplitudes are in scene units again."""

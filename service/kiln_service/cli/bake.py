@@ -35,6 +35,7 @@ from kiln_service.cli.api import Api
 from kiln_service.cli.bundle import LocalBundle, collect
 from kiln_service.cli.farm import LocalFarm, share
 from kiln_service.cli.fetch import download_package, remove_package, writing
+from kiln_service.cli.output import notices
 from kiln_service.cli.progress import Display, follow, make_display, raise_unless_completed
 from kiln_service.cli.upload import upload_and_submit
 
@@ -106,8 +107,12 @@ def bake(options: BakeOptions) -> Summary:
             return _summary(options.out, None, (), began)
         _make_room(options, data)
         _write(data / RECORD, record)
-    with make_display() as display:
-        job, tasks = _run(options, data, record, local, display)
+    try:
+        with make_display() as display:
+            job, tasks = _run(options, data, record, local, display)
+    except KeyboardInterrupt:
+        notices.print(f"Interrupted. Continue with: lightkiln bake --resume --out {options.out}", markup=False)
+        raise
     _write(options.out / RECORD, record)
     if not options.keep:
         shutil.rmtree(data, ignore_errors=True)

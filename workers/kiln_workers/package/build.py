@@ -243,6 +243,7 @@ def _manifest(package: _Package) -> Manifest:
         settings=payload.settings,
         scene_hash=payload.prepare.scene_hash,
         inputs=dict(payload.bundle.files),
+        environment=payload.bundle.environment,
         seeds={"settings": payload.settings.seed},
         exposure={str(fit.function): fit.exposure for fit in payload.fits if fit.function in given.lobes},
         metrics=ManifestMetrics(
