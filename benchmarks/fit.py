@@ -19,7 +19,7 @@ from kiln_schemas.settings import FitSettings, Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.fit import train as training
 from kiln_workers.fit.lobes import constrain
-from kiln_workers.fit.loss import draw_sample, log_loss, sample_weights
+from kiln_workers.fit.loss import jittered_directions, log_loss, step_weights
 from kiln_workers.fit.metrics import exposure_of, texel_errors
 from kiln_workers.fit.optimizer import one_cycle
 from kiln_workers.fit.source import ArraySource, StoreSource
@@ -57,10 +57,9 @@ def direct_error(source: ArraySource, function: Function, lobes: int, texels: in
     optimizer = torch.optim.Adam([raw], betas=(0.9, 0.99))
     for step in range(steps):
         optimizer.param_groups[0]["lr"] = one_cycle(step, steps, 0.1)
-        sample = draw_sample(source.image_size, 2, np.random.default_rng([1, step]))
-        loss = log_loss(
-            constrain(raw, normal), log_targets[:, sample.pixels], sample.directions, sample_weights(sample, normal)
-        )
+        directions = jittered_directions(source.image_size, np.random.default_rng([1, step]))
+        weights = step_weights(directions, normal, source.image_size)
+        loss = log_loss(constrain(raw, normal), log_targets, directions, weights)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

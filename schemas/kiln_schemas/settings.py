@@ -66,7 +66,7 @@ class FitSettings(Contract):
     steps: int = Field(ge=1, le=1_000_000, description="optimiser steps per network")
     batch: int = Field(default=32, ge=1, le=1024, description="texels per step")
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
-    window: int = Field(default=2048, ge=1, le=1_000_000, description="texels in the shuffle window")
+    window: int = Field(default=4096, ge=1, le=1_000_000, description="texels in the shuffle window")
     checkpoint_s: float = Field(default=60.0, ge=1.0, le=3600.0, description="seconds between checkpoints")
 
 
@@ -92,7 +92,7 @@ PRESETS: Final[Mapping[str, BakeSettings]] = {
         preset="draft",
         lightmap=LightmapSettings(resolution=32, tile=8),
         render=RenderSettings(image_size=32, samples=16, irradiance_samples=512),
-        fit=FitSettings(lobes=8, steps=600),
+        fit=FitSettings(lobes=8, steps=1000),
         package=PackageSettings(environment_size=64),
     ),
     "preview": BakeSettings(

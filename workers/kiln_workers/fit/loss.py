@@ -6,7 +6,6 @@ horizon, else 0. One step evaluates the same directions for all texels, so lambd
 one matrix product; the paper's appendix A gives the derivatives. `reference_loss` is the same by plain autograd.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,39 +17,19 @@ from kiln_workers.fit.network import pixel_centres, solid_angles
 from kiln_workers.sphere import octahedral
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Where one training step evaluates the lobes; shared by all texels of the step."""
-
-    pixels: Tensor  # [K] int64, row-major pixel index
-    directions: Tensor  # [K, 3] a uniformly drawn direction inside each of them
-    solid_angles: Tensor  # [K] divided by the pixel's probability of being drawn
-    centres: Tensor  # [K, 3] directions of the pixels' centres
-
-    def to(self, device: torch.device) -> "Sample":
-        """The same on another device."""
-        return Sample(
-            *(tensor.to(device) for tensor in (self.pixels, self.directions, self.solid_angles, self.centres))
-        )
+def jittered_directions(size: int, rng: np.random.Generator) -> Tensor:
+    """A uniformly drawn direction inside each pixel [R * R, 3], row-major; one step's texels share them."""
+    column, row = np.meshgrid(np.arange(size), np.arange(size), indexing="xy")
+    position = np.stack([column, row], axis=-1) + rng.random((size, size, 2))
+    directions = octahedral.decode(2.0 * position / size - 1.0)
+    return torch.from_numpy(directions.reshape(-1, 3).astype(np.float32))
 
 
-def draw_sample(size: int, block: int, rng: np.random.Generator) -> Sample:
-    """One random pixel of every block x block pixels (all of them with block 1), jittered inside."""
-    blocks = size // block
-    corner = np.stack(np.meshgrid(np.arange(blocks), np.arange(blocks), indexing="xy"), axis=-1) * block
-    pixel = corner + rng.integers(block, size=(blocks, blocks, 2))  # [.., (column, row)]
-    position = pixel + rng.random((blocks, blocks, 2))
-    directions = octahedral.decode(2.0 * position / size - 1.0).reshape(-1, 3)
-    index = torch.from_numpy((pixel[..., 1] * size + pixel[..., 0]).reshape(-1))
-    weight = solid_angles(size)[index] * float(block * block)
-    return Sample(index, torch.from_numpy(directions.astype(np.float32)), weight, pixel_centres(size)[index])
-
-
-def sample_weights(sample: Sample, normals: Tensor) -> Tensor:
-    """Weights [T, K] of texels with normals [T, 3]; a texel's weights add up to about 2 pi."""
-    centre = normals @ sample.centres.T
-    jittered = normals @ sample.directions.T
-    return torch.where(torch.minimum(centre, jittered) > 0.0, sample.solid_angles, 0.0)
+def step_weights(directions: Tensor, normals: Tensor, size: int) -> Tensor:
+    """Weights [T, R * R] of texels with normals [T, 3]; a texel's weights add up to about 2 pi."""
+    centre = normals @ pixel_centres(size).to(normals.device).T
+    jittered = normals @ directions.T
+    return torch.where(torch.minimum(centre, jittered) > 0.0, solid_angles(size).to(normals.device), 0.0)
 
 
 def log_loss(lobes: Tensor, log_targets: Tensor, directions: Tensor, weights: Tensor) -> Tensor:

@@ -24,6 +24,9 @@ CHANNELS = (4, 32, 64, 128, 256)
 LAST_LAYER_GAIN = 0.1
 """Scale of the last layer's start: outputs are small, so a fit starts from the even picture of `lobes`."""
 
+INPUT_GAIN = 8.0
+"""Brings the input, whose spread is about 0.2, above one: the first layers learn sooner."""
+
 
 @dataclass(frozen=True)
 class Shape:
@@ -86,7 +89,7 @@ def encode(layers: list[Tensor], inputs: Tensor) -> Tensor:
 
 def lobes(layers: list[Tensor], images: Tensor, normals: Tensor, exposure: float) -> Tensor:
     """Lobes [T, N, 7] in exposure-normalised radiance of images [T, R, R, 3] with normals [T, 3]."""
-    return constrain(encode(layers, network_input(images, normals, exposure)), normals)
+    return constrain(encode(layers, INPUT_GAIN * network_input(images, normals, exposure)), normals)
 
 
 @lru_cache(maxsize=4)

@@ -23,9 +23,9 @@ from kiln_schemas.errors import FitFailed, InputError
 from kiln_schemas.settings import FitSettings, Function
 from kiln_schemas.tasks import CurvePoint, FitMetrics, Progress
 from kiln_workers.fit.lobes import constrain
-from kiln_workers.fit.loss import Sample, draw_sample, log_loss, sample_weights
+from kiln_workers.fit.loss import jittered_directions, log_loss, step_weights
 from kiln_workers.fit.metrics import TexelErrors, exposure_of, texel_errors
-from kiln_workers.fit.network import Shape, encode, initial_parameters, network_input, split
+from kiln_workers.fit.network import INPUT_GAIN, Shape, encode, initial_parameters, network_input, split
 from kiln_workers.fit.optimizer import Adam, one_cycle
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.source import Float16, Float32, TexelSource
@@ -34,9 +34,6 @@ from kiln_workers.fit.threads import single_threaded_pool
 from kiln_workers.scene.container import pack, unpack
 
 MICRO_BATCHES: Final = 4
-PIXEL_BLOCK: Final = 2
-"""A step evaluates one pixel of each PIXEL_BLOCK x PIXEL_BLOCK block."""
-
 CURVE_POINTS: Final = 200
 FAILURE_RATIO: Final = 0.5
 """A fit whose error is above this fraction of the error of P = 0 has failed."""
@@ -150,11 +147,11 @@ class _Trainer:
         """One optimiser step; the loss joins the curve."""
         state, settings = self._state, self._settings
         rng = np.random.default_rng([self._seed, _PIXEL_STREAM, state.step])
-        sample = draw_sample(self._shape.image_size, PIXEL_BLOCK, rng).to(self._device)
+        directions = jittered_directions(self._shape.image_size, rng).to(self._device)
         parts = np.array_split(np.arange(len(batch.images)), MICRO_BATCHES)
 
         def gradient(part: npt.NDArray[np.int64]) -> tuple[float, Tensor]:
-            return self._gradient(batch.images[part], batch.normals[part], sample, len(batch.images))
+            return self._gradient(batch.images[part], batch.normals[part], directions, len(batch.images))
 
         results = list(self._run(gradient, [part for part in parts if len(part)]))
         rate = one_cycle(state.step, settings.steps, settings.learning_rate)
@@ -166,16 +163,16 @@ class _Trainer:
         """Map over the pool; one after the other on a GPU, which one stream of kernels keeps busy."""
         return map(work, parts) if self._device.type == "cuda" else self._pool.map(work, parts)
 
-    def _gradient(self, images: Float16, normals: Float32, sample: Sample, batch: int) -> tuple[float, Tensor]:
+    def _gradient(self, images: Float16, normals: Float32, directions: Tensor, batch: int) -> tuple[float, Tensor]:
         """Loss and flat gradient [P] of a micro-batch, as its share of a batch of `batch` texels."""
         pixels = torch.from_numpy(images).to(self._device)
         normal = torch.from_numpy(normals).to(self._device)
         layers = [layer.detach().requires_grad_() for layer in split(self._shape, self._state.adam.parameters)]
         inputs = network_input(pixels, normal, self._state.exposure)
-        log_targets = inputs[:, :3].permute(0, 2, 3, 1).flatten(1, 2)[:, sample.pixels]
-        weights = sample_weights(sample, normal) / (2.0 * np.pi * 3.0 * batch)
-        lobes = constrain(encode(layers, inputs), normal)
-        loss = log_loss(lobes, log_targets, sample.directions, weights)
+        log_targets = inputs[:, :3].permute(0, 2, 3, 1).flatten(1, 2)
+        weights = step_weights(directions, normal, self._shape.image_size) / (2.0 * np.pi * 3.0 * batch)
+        lobes = constrain(encode(layers, INPUT_GAIN * inputs), normal)
+        loss = log_loss(lobes, log_targets, directions, weights)
         gradients = torch.autograd.grad(loss, layers)
         return float(loss.detach()), torch.cat([gradient.reshape(-1) for gradient in gradients])
 
