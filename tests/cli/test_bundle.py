@@ -123,6 +123,12 @@ def test_a_map_missing_from_a_material_library_names_the_library(tmp_path: Path)
         collect(tmp_path / "a.obj")
 
 
+def test_a_missing_material_library_is_left_to_the_reader_who_uses_defaults(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("mtllib gone.mtl here.mtl\n")
+    (tmp_path / "here.mtl").write_text("newmtl red\n")
+    assert set(files(tmp_path / "a.obj")) == {"a.obj", "here.mtl"}
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [("a.gltf", b"{"), ("a.gltf", b"\xff\xfe"), ("a.glb", b"glTF"), ("a.glb", b"x" * 64), ("a.xml", b"<scene>")],

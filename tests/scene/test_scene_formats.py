@@ -76,6 +76,20 @@ def test_obj_faults(tmp_path):
         assert says in refused(tmp_path, "b.obj"), text
 
 
+def test_obj_with_several_libraries_and_names_with_spaces(tmp_path, write_image):
+    text = OBJ.replace("mtllib set.mtl", "mtllib gone.mtl first.mtl\nmtllib my second.mtl")
+    (tmp_path / "a.obj").write_text(text)
+    shiny, lamp = MTL.split("newmtl lamp")
+    (tmp_path / "first.mtl").write_text(shiny + "map_Kd -s 2 2 2 -clamp on red wood.png\n")
+    (tmp_path / "my second.mtl").write_text("newmtl lamp" + lamp)
+    write_image(tmp_path / "red wood.png", np.full((2, 2, 3), 255, np.uint8))
+    scene = load_scene(tmp_path, "a.obj")
+    plate, flag = (scene.materials[mesh.material] for mesh in scene.meshes)
+    assert scene.images[plate.base_color_texture.image].name == "red wood.png"
+    assert flag.emission == (5.0, 4.0, 3.0)
+    assert sum("is missing" in note for note in scene.notes) == 1
+
+
 PLY_HEAD = """ply
 format {kind} 1.0
 element vertex 4

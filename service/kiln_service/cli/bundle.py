@@ -161,13 +161,15 @@ def _gltf_uris(document: Any, name: str) -> References:
 
 
 def _obj(folder: Path, name: str) -> References:
+    """Material libraries and their maps; a library that is missing is left out, as the reader does, who notes it."""
     for arguments in _statements(folder / name, {"mtllib"}):
         # A name may hold spaces, and a statement may hold several names: the file system decides.
         whole = (folder / name).parent / arguments
         for library in [arguments] if whole.is_file() else arguments.split():
             path = _joined(name, library)
-            yield path, name
-            yield from _mtl(_inside(folder, path, name), path)
+            if (folder / path).is_file():
+                yield path, name
+                yield from _mtl(_inside(folder, path, name), path)
 
 
 def _mtl(file: Path, name: str) -> References:

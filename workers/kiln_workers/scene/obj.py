@@ -147,7 +147,7 @@ def _read_libraries(
     bundle: BundleFolder, libraries: list[str], images: list[Image], notes: list[str]
 ) -> dict[str, Material]:
     materials: dict[str, Material] = {}
-    for library in dict.fromkeys(libraries):
+    for library in dict.fromkeys(name for line in libraries for name in _library_names(line, bundle)):
         name = bundle.name(library)
         if not (bundle.folder / name).is_file():
             notes.append(f"'{bundle.origin}': the material library '{library}' is missing; defaults are used.")
@@ -163,6 +163,11 @@ def _read_libraries(
         for title, table in tables.items():
             materials[title] = _material(title, table, inner, images)
     return materials
+
+
+def _library_names(line: str, bundle: BundleFolder) -> list[str]:
+    """The names of an `mtllib` line: one that may hold spaces, or several; the files that there are decide."""
+    return [line] if (bundle.folder / bundle.name(line)).is_file() else line.split()
 
 
 def _material(title: str, table: dict[str, str], bundle: BundleFolder, images: list[Image]) -> Material:
@@ -197,7 +202,16 @@ def _material(title: str, table: dict[str, str], bundle: BundleFolder, images: l
 def _texture(line: str | None, title: str, bundle: BundleFolder, images: list[Image]) -> TextureRef | None:
     if not line:
         return None
-    name = line.split()[-1] if line.startswith("-") else line
+    name = _map_file(line, bundle)
     data = bundle.read(name, "texture")
     images.append(make_image(data, name, True, f"material '{title}', texture '{name}'"))
     return TextureRef(len(images) - 1)
+
+
+def _map_file(line: str, bundle: BundleFolder) -> str:
+    """The file name of a map statement: behind its options the longest that is a file's, as names may hold spaces."""
+    if not line.startswith("-"):
+        return line
+    words = line.split()
+    names = [" ".join(words[start:]) for start in range(1, len(words))]
+    return next((name for name in names if (bundle.folder / bundle.name(name)).is_file()), words[-1])
