@@ -20,9 +20,13 @@
 A message names the place (mesh, file, field), the value and the remedy.
 """
 
-from typing import ClassVar, Self
+import errno
+from typing import ClassVar, Final, Self
 
 from kiln_schemas.base import Contract
+
+DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""`OSError.errno` of a disk, a quota or a file at its limit; told as MachineLacks wherever files are written."""
 
 
 class Problem(Contract):

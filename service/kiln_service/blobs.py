@@ -8,7 +8,6 @@ does not happen. Publication and collection of the same blob exclude each other 
 
 import asyncio
 import contextlib
-import errno
 import hashlib
 import os
 import shutil
@@ -23,14 +22,13 @@ import psycopg
 from obstore.exceptions import BaseError
 from obstore.store import ObjectStore, from_url
 
-from kiln_schemas.errors import InputError, MachineLacks, NotFound, TooLarge, Truncated
+from kiln_schemas.errors import DISK_FULL, InputError, MachineLacks, NotFound, TooLarge, Truncated
 from kiln_service.config import Limits
 from kiln_service.db import Database, Tx
 
 WRITE_BYTES: Final = 2**20
 """Uploads go to the disk in pieces of at least this size."""
 READ_BYTES: Final = 2**20
-NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class Blobs:
@@ -235,7 +233,7 @@ def _no_space_is_507(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in NO_SPACE:
+        if error.errno not in DISK_FULL:
             raise
         raise MachineLacks(
             f"the disk is full: {error.strerror}",

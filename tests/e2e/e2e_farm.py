@@ -114,10 +114,16 @@ class Farm:
         wait_until("the coordinator is ready", self._ready)
         self.token = (data / "token").read_text().strip()
 
-    def start_worker(self, name: str, *flags: str) -> None:
+    def start_worker(self, name: str, *flags: str, preexec: Callable[[], None] | None = None) -> None:
+        """Start a worker; `preexec` runs in its process first."""
         common = ["-m", "kiln_workers", "worker", "--url", self.url, "--token-file", str(self.folder / "data/token")]
         scratch = ["--name", name, "--scratch", str(self.folder / f"scratch-{name}")]
-        self._start(name, [*common, *scratch, *flags])
+        self._start(name, [*common, *scratch, *flags], preexec)
+
+    def end(self, name: str) -> None:
+        """SIGTERM, and wait."""
+        self.processes[name].terminate()
+        self.processes[name].wait(30)
 
     def kill(self, name: str, *, children_only: bool = False) -> None:
         """kill -9 of a process, or of its children alone."""
@@ -161,9 +167,11 @@ class Farm:
                 process.kill()
                 process.wait()
 
-    def _start(self, name: str, arguments: list[str]) -> None:
+    def _start(self, name: str, arguments: list[str], preexec: Callable[[], None] | None = None) -> None:
         with (self.folder / f"{name}.log").open("ab") as log:
-            self.processes[name] = subprocess.Popen([sys.executable, *arguments], stdout=log, stderr=log)
+            self.processes[name] = subprocess.Popen(
+                [sys.executable, *arguments], stdout=log, stderr=log, preexec_fn=preexec
+            )
 
     def _ready(self) -> bool:
         assert self.processes["coordinator"].poll() is None, (self.folder / "coordinator.log").read_text()

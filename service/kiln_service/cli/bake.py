@@ -31,6 +31,7 @@ from kiln_schemas.errors import (
 )
 from kiln_schemas.job import JobRequest, JobView, TaskView
 from kiln_schemas.settings import make_settings
+from kiln_schemas.states import JobState
 from kiln_service.cli.api import Api
 from kiln_service.cli.bundle import LocalBundle, collect
 from kiln_service.cli.farm import LocalFarm, share
@@ -72,8 +73,6 @@ class Record(Contract):
     """The scene's file."""
     environment: str | None
     request: JobRequest
-    job_id: str | None = None
-    """None until the coordinator has accepted the job."""
 
 
 class Summary(Contract):
@@ -109,10 +108,13 @@ def bake(options: BakeOptions) -> Summary:
         _write(data / RECORD, record)
     try:
         with make_display() as display:
-            job, tasks = _run(options, data, record, local, display)
+            job, tasks = _run(options, data, record.request, local, display)
     except KeyboardInterrupt:
         notices.print(f"Interrupted. Continue with: lightkiln bake --resume --out {options.out}", markup=False)
         raise
+    if job.error is not None and not options.keep and isinstance(KilnError.from_problem(job.error), InputError):
+        _leave_nothing(options.out, data)
+    raise_unless_completed(job)
     _write(options.out / RECORD, record)
     if not options.keep:
         shutil.rmtree(data, ignore_errors=True)
@@ -120,18 +122,19 @@ def bake(options: BakeOptions) -> Summary:
 
 
 def _run(
-    options: BakeOptions, data: Path, record: Record, local: LocalBundle, display: Display
+    options: BakeOptions, data: Path, request: JobRequest, local: LocalBundle, display: Display
 ) -> tuple[JobView, tuple[TaskView, ...]]:
-    """Start everything, bring the job to its end, download, stop everything."""
+    """Start everything, bring the job to its end, download where it completed, stop everything."""
     count, threads, memory = share(options.workers)
     with LocalFarm(data, workers=count, threads=threads, memory=memory, say=display.say) as farm:
         farm.start()
         with Api(farm.url, farm.token, patience_s=2.0) as api:
-            job_id = record.job_id or _steadily(farm, lambda: _known_job(api))
+            job_id = _steadily(farm, lambda: _unfinished_job(api, display))
             if job_id is None:
-                job_id = _steadily(farm, lambda: upload_and_submit(api, local, record.request, bar=False)).id
-            _write(data / RECORD, record.model_copy(update={"job_id": job_id}))
-            job = raise_unless_completed(follow(api, job_id, display, between=farm.revive))
+                job_id = _steadily(farm, lambda: upload_and_submit(api, local, request, bar=False)).id
+            job = follow(api, job_id, display, between=farm.revive)
+            if job.state is not JobState.COMPLETED:
+                return job, ()
             tasks = _steadily(farm, lambda: api.tasks(job.id))
             _steadily(farm, lambda: download_package(api, job.id, options.out, force=True, bar=False))
     return job, tasks
@@ -149,10 +152,26 @@ def _steadily(farm: LocalFarm, call: Callable[[], T]) -> T:
             farm.revive()
 
 
-def _known_job(api: Api) -> str | None:
-    """The job of an earlier call that was interrupted before it could note the id; the data folder holds one bake."""
-    jobs = api.jobs(limit=1).jobs
-    return jobs[0].id if jobs else None
+def _unfinished_job(api: Api, display: Display) -> str | None:
+    """The job of an earlier call, noted or not, which this one can go on with; the data folder holds one bake.
+
+    A job that failed stays failed, but what it lacked may be there now: then None, for a new job.
+    """
+    newest = next(iter(api.jobs(limit=1).jobs), None)
+    if newest is None:
+        return None
+    if newest.state in (JobState.FAILED, JobState.CANCELED):
+        why = f" ({newest.error.detail})" if newest.error else ""
+        display.say(f"The bake {newest.state.value} before{why}; it begins anew.")
+        return None
+    return newest.id
+
+
+def _leave_nothing(out: Path, data: Path) -> None:
+    """Remove what a bake of a wrong input left: the same input cannot be resumed, and a mended one begins anew."""
+    shutil.rmtree(data, ignore_errors=True)
+    with suppress(OSError):
+        out.rmdir()
 
 
 def _planned(options: BakeOptions) -> Record:

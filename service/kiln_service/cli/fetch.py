@@ -5,24 +5,20 @@ last. Files of an older package in `DIR` go first, its manifest before the other
 """
 
 import contextlib
-import errno
 import json
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
 
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 
 from kiln_schemas.conventions import MANIFEST_JSON
-from kiln_schemas.errors import Conflict, InputError, MachineLacks
+from kiln_schemas.errors import DISK_FULL, Conflict, InputError, MachineLacks
 from kiln_schemas.job import check_bundle_path
 from kiln_schemas.tasks import Artifact
 from kiln_service.cli.api import Api
 from kiln_service.cli.bundle import sha256_of
 from kiln_service.cli.output import notices
-
-DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 def download_package(api: Api, job_id: str, out: Path, *, force: bool = False, bar: bool = True) -> list[Path]:

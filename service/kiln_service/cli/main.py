@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from kiln_schemas import __version__
-from kiln_schemas.errors import Canceled, KilnError, MachineLacks
+from kiln_schemas.errors import DISK_FULL, Canceled, KilnError, MachineLacks
 from kiln_schemas.job import JobRequest
 from kiln_schemas.settings import make_settings
 from kiln_schemas.states import FINAL_JOB_STATES, JobState
@@ -25,7 +25,7 @@ from kiln_service.cli import bake as baking
 from kiln_service.cli import options
 from kiln_service.cli.bundle import collect
 from kiln_service.cli.doctor import examine
-from kiln_service.cli.fetch import DISK_FULL, download_package
+from kiln_service.cli.fetch import download_package
 from kiln_service.cli.output import (
     defect,
     duration,

@@ -6,7 +6,6 @@ and not the worker, and so that a task can be stopped at any instruction. Starte
 """
 
 import contextlib
-import errno
 import importlib
 import logging
 import os
@@ -16,10 +15,10 @@ import shutil
 import sys
 import threading
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO
 
 from kiln_schemas.base import Contract
-from kiln_schemas.errors import InternalError, KilnError, MachineLacks
+from kiln_schemas.errors import DISK_FULL, InternalError, KilnError, MachineLacks
 from kiln_schemas.tasks import Claim, Progress, Result, TaskKind
 from kiln_workers.runner.blobs import BlobCache
 from kiln_workers.runner.client import CoordinatorClient
@@ -28,8 +27,6 @@ from kiln_workers.runner.protocol import Done, Failed, Ready, Report, Setup, Sto
 from kiln_workers.runner.tether import die_with_parent
 
 log = logging.getLogger(__name__)
-
-DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 class Child:
