@@ -1,0 +1,172 @@
+"""A package read back from its own files, as an engine loads it: scene, textures, environment.
+
+Nothing comes from the store, the network or the bundle: what is wrong here is wrong for whoever downloads the package.
+`Incident` is the seam to `stored`, which answers the same questions from the light-field store instead.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, Self
+
+import numpy as np
+import numpy.typing as npt
+import OpenEXR
+import torch
+from pydantic import ValidationError
+from torch import Tensor
+
+from kiln_schemas.conventions import (
+    ENVIRONMENT_GGX_KTX2,
+    ENVIRONMENT_U_KTX2,
+    FORMAT_VERSION,
+    IRRADIANCE_EXR,
+    LIGHT_FIELD_KTX2,
+    MANIFEST_JSON,
+    SCENE_GLB,
+    VISIBILITY_KTX2,
+)
+from kiln_schemas.errors import InputError, NotFound
+from kiln_schemas.manifest import Manifest
+from kiln_workers.package import ktx2
+from kiln_workers.package.half import layers_to_lobes
+from kiln_workers.scene.gltf import read_gltf
+from kiln_workers.scene.model import Scene
+from kiln_workers.shade import algorithm, textures
+
+Float32 = npt.NDArray[np.float32]
+
+
+class Incident(Protocol):
+    """The light that arrives at P points of the light map: uv [P, 2]."""
+
+    def reflected(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
+        """Integral of the light field times D [P, 3]."""
+        ...
+
+    def visibility(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
+        """W_E at the specular direction [P, 3]."""
+        ...
+
+
+@dataclass(frozen=True)
+class LobeTextures:
+    """Incident light from the lobe textures."""
+
+    light_field: Tensor  # [H, W, N, 7]
+    visibility_lobes: Tensor | None  # [H, W, N, 7]; None without an environment
+
+    def reflected(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
+        lobes = algorithm.unit_lobes(textures.bilinear(self.light_field, uv))
+        return algorithm.convolved(lobes, algorithm.reflection_kernel(surface))
+
+    def visibility(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
+        if self.visibility_lobes is None:
+            return torch.ones_like(surface.normal)
+        lobes = algorithm.unit_lobes(textures.bilinear(self.visibility_lobes, uv))
+        return algorithm.lobe_sum(lobes, surface.specular)
+
+
+@dataclass(frozen=True)
+class EnvironmentLookup:
+    """The preconvolved environment."""
+
+    u: Tensor  # [A, R, R, 3] octahedral maps of U, not normalised
+    alphas: Tensor  # [A] ascending
+    mirror: Tensor  # [6, S, S, 3] the sharpest mip of the cube map
+
+    def convolved(self, directions: Tensor, alpha: Tensor) -> Tensor:
+        """U(direction, alpha) [P, 3], linear between the layers that enclose alpha [P]."""
+        upper = torch.searchsorted(self.alphas, alpha.contiguous()).clamp(max=len(self.alphas) - 1)
+        lower = (upper - 1).clamp(min=0)
+        span = (self.alphas[upper] - self.alphas[lower]).clamp(min=1e-12)
+        share = ((alpha - self.alphas[lower]) / span).clamp(0.0, 1.0)[:, None]
+        uv = textures.octahedral_uv(directions)
+        out = torch.zeros_like(directions)
+        for number in range(len(self.alphas)):
+            weight = torch.where(lower == number, 1.0 - share[:, 0], 0.0) + torch.where(upper == number, share[:, 0], 0.0)
+            weight = torch.where(lower == upper, torch.where(upper == number, 1.0, 0.0), weight)
+            at = weight > 0.0
+            out[at] += weight[at, None] * textures.bilinear(self.u[number], uv[at])
+        return out
+
+    def seen(self, directions: Tensor) -> Tensor:
+        """The environment itself [P, 3] in directions [P, 3], as sharp as the package holds it."""
+        return textures.cube(self.mirror, directions)
+
+
+@dataclass(frozen=True)
+class ShadePackage:
+    """A package, ready to shade from."""
+
+    manifest: Manifest
+    scene: Scene
+    irradiance: Tensor  # [H, W, 3]
+    lobes: LobeTextures
+    environment: EnvironmentLookup | None
+
+    @classmethod
+    def read(cls, folder: Path, device: torch.device) -> Self:
+        """Read the package in `folder`; NotFound where there is none, InputError where it is damaged or too new."""
+        manifest = read_manifest(folder)
+        scene = read_gltf(folder, SCENE_GLB)
+        for mesh in scene.meshes:
+            if mesh.lightmap_uv is None:
+                raise InputError("has no TEXCOORD_1", where=f"{folder / SCENE_GLB}: {mesh.name}")
+        visible = _lobes(folder, VISIBILITY_KTX2, device) if VISIBILITY_KTX2 in manifest.textures else None
+        return cls(
+            manifest=manifest,
+            scene=scene,
+            irradiance=torch.from_numpy(read_exr(folder / IRRADIANCE_EXR)).to(device),
+            lobes=LobeTextures(_lobes(folder, LIGHT_FIELD_KTX2, device), visible),
+            environment=_environment(folder, manifest, device),
+        )
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a package."""
+    path = folder / MANIFEST_JSON
+    try:
+        manifest = Manifest.model_validate_json(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise NotFound("there is no package", where=str(folder), remedy="Name a folder with a manifest.json.") from None
+    except (OSError, ValidationError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {type(error).__name__}", where=str(path), remedy="Bake it again.") from None
+    if manifest.format_version > FORMAT_VERSION:
+        raise InputError(
+            f"has format version {manifest.format_version}, this program reads up to {FORMAT_VERSION}",
+            where=str(path),
+            remedy="Update lightkiln.",
+        )
+    return manifest
+
+
+def read_exr(path: Path) -> Float32:
+    """Linear RGB [H, W, 3] of an EXR; InputError where it cannot be read."""
+    try:
+        with OpenEXR.File(str(path)) as file:
+            channels = file.channels()
+            if "RGB" not in channels:
+                raise InputError(f"has the channels {', '.join(channels)} instead of R, G, B", where=str(path))
+            return np.array(channels["RGB"].pixels, dtype=np.float32)
+    except (RuntimeError, OSError, ValueError) as error:
+        raise InputError(f"cannot be read as OpenEXR: {error}", where=str(path)) from None
+
+
+def _lobes(folder: Path, name: str, device: torch.device) -> Tensor:
+    texture = ktx2.read(folder / name)
+    return torch.from_numpy(layers_to_lobes(texture.levels[0][:, 0])).to(device)
+
+
+def _environment(folder: Path, manifest: Manifest, device: torch.device) -> EnvironmentLookup | None:
+    described = manifest.textures.get(ENVIRONMENT_U_KTX2)
+    if described is None:
+        return None
+    layers = ktx2.read(folder / ENVIRONMENT_U_KTX2).levels[0][:, 0, ..., :3].astype(np.float32)
+    if described["normalised"]:
+        layers = layers * np.asarray(described["lobe_integrals"], np.float32)[:, None, None, None]
+    cube = ktx2.read(folder / ENVIRONMENT_GGX_KTX2).levels[0][0, ..., :3].astype(np.float32)
+    return EnvironmentLookup(
+        torch.from_numpy(layers).to(device),
+        torch.tensor(described["alphas"], dtype=torch.float32, device=device),
+        torch.from_numpy(cube).to(device),
+    )

@@ -1,0 +1,89 @@
+"""Pictures of a package: the terms of section 6 over a G-buffer, averaged over each pixel's samples."""
+
+from collections.abc import Collection
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from kiln_workers.scene.model import Float32
+from kiln_workers.shade import algorithm, textures
+from kiln_workers.shade.gbuffer import GBuffer
+from kiln_workers.shade.package import Incident, ShadePackage
+
+POINTS_AT_ONCE: Final = 1 << 16
+
+
+class Term(StrEnum):
+    """A part of a picture; the default picture is the sum of all but UNOCCLUDED."""
+
+    EMISSION = "emission"
+    """What surfaces emit themselves."""
+    DIFFUSE = "diffuse"
+    """The irradiance map on what is not metal."""
+    INTERREFLECTION = "interreflection"
+    """Glossy reflection of the scene: the light field."""
+    ENVIRONMENT = "environment"
+    """Glossy reflection of the environment: U W_E (eq. 8)."""
+    UNOCCLUDED = "unoccluded"
+    """The same without visibility: U alone (eq. 4), for comparison."""
+    BACKGROUND = "background"
+    """The environment where no surface is."""
+
+
+WHOLE: Final = tuple(term for term in Term if term is not Term.UNOCCLUDED)
+
+
+def shade(
+    package: ShadePackage, buffer: GBuffer, terms: Collection[Term] = WHOLE, incident: Incident | None = None
+) -> Float32:
+    """Radiance [H, W, 3], the sum of `terms`; glossy light from `incident`, by default the package's lobes."""
+    height, width, samples = buffer.hit.shape
+    out = np.zeros((height * width * samples, 3), np.float32)
+    hit = buffer.hit.ravel()
+    surfaces = np.zeros((len(buffer), 3), np.float32)
+    # Points of one part of the light map are shaded together: a store is then read once.
+    at_once = POINTS_AT_ONCE if incident is None else max(len(buffer), 1)
+    for start in range(0, len(buffer), at_once):
+        part = slice(start, start + at_once)
+        surfaces[part] = _shade_points(package, buffer, part, terms, incident or package.lobes)
+    out[hit] = surfaces
+    if Term.BACKGROUND in terms and package.environment is not None and not hit.all():
+        directions = _tensor(buffer.directions.reshape(-1, 3)[~hit], package.irradiance)
+        out[~hit] = package.environment.seen(directions).cpu().numpy()
+    return out.reshape(height, width, samples, 3).mean(axis=2)
+
+
+def _shade_points(
+    package: ShadePackage, buffer: GBuffer, part: slice, terms: Collection[Term], incident: Incident
+) -> Float32:
+    """Radiance [P, 3] of some of the G-buffer's points."""
+    like = package.irradiance
+    uv = _tensor(buffer.lightmap_uv[part], like)
+    surface = algorithm.Surface(
+        normal=_tensor(buffer.normal[part], like),
+        view=_tensor(buffer.view[part], like),
+        base_color=_tensor(buffer.base_color[part], like),
+        metallic=_tensor(buffer.metallic[part], like),
+        alpha=_tensor(buffer.alpha[part], like),
+    )
+    glossy = torch.zeros_like(surface.normal)
+    if Term.INTERREFLECTION in terms:
+        glossy += incident.reflected(uv, surface)
+    if package.environment is not None and (Term.ENVIRONMENT in terms or Term.UNOCCLUDED in terms):
+        u = package.environment.convolved(surface.specular, surface.alpha)
+        glossy += u * incident.visibility(uv, surface) if Term.ENVIRONMENT in terms else u
+    radiance = glossy * algorithm.specular_factor(surface)
+    if Term.DIFFUSE in terms:
+        radiance += algorithm.diffuse(surface, textures.bilinear(package.irradiance, uv))
+    radiance *= _tensor(buffer.reflects[part].astype(np.float32), like)[:, None]
+    if Term.EMISSION in terms:
+        radiance += _tensor(buffer.emission[part], like)
+    return np.asarray(radiance.cpu().numpy(), np.float32)
+
+
+def _tensor(values: npt.NDArray[np.float32], like: Tensor) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values)).to(like)
