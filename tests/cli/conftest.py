@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -77,9 +78,12 @@ class Running:
 
 
 @pytest.fixture(scope="session")
-def coordinator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    data = tmp_path_factory.mktemp("coordinator")
-    with LocalFarm(data, workers=0, threads=1, memory=1 << 30, say=lambda message: None) as farm:
+def coordinator() -> Iterator[Running]:
+    # Not in pytest's own folder: another run as root would make that private, and the database could not go on.
+    with (
+        TemporaryDirectory(prefix="lightkiln-cli-") as folder,
+        LocalFarm(data := Path(folder), workers=0, threads=1, memory=1 << 30, say=lambda message: None) as farm,
+    ):
         farm.start()
         yield Running(farm.url, data, farm)
 

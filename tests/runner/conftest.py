@@ -109,7 +109,8 @@ class Routes(BaseHTTPRequestHandler):
             time.sleep(0.02)
             self._answer(204, None)
         elif ending == "heartbeat":
-            self._answer(200, {"stop": self.state.stop, "reason": "canceled"})
+            # Stop a stage only once it has reported progress, so that it has certainly begun.
+            self._answer(200, {"stop": self.state.stop and bool(body.get("progress")), "reason": "canceled"})
         elif ending == "missing":
             self._answer(200, {"missing": [sha for sha in body["sha256"] if sha not in self.state.blobs]})
         else:
