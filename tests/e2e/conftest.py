@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from e2e_farm import Farm, room, sky
+import seaweed
+from e2e_farm import Farm, lightkiln, room, settings, sky
 
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.scene.examples import write_exr
@@ -36,6 +37,24 @@ def folder() -> Iterator[Path]:
     """A folder for one test."""
     with tempfile.TemporaryDirectory(prefix="lightkiln-e2e-") as folder:
         yield Path(folder)
+
+
+@pytest.fixture(scope="session")
+def baked(room_files: tuple[Path, Path], session_folder: Path) -> Path:
+    """The room under its sky, baked by one command and kept."""
+    out = session_folder / "baked"
+    scene, environment = room_files
+    done = lightkiln("bake", scene, "--env", environment, "--preset", "draft", *settings(), "--out", out, "--keep")
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.fixture
+def s3_server(folder: Path) -> Iterator[seaweed.S3Server]:
+    """A real S3 endpoint."""
+    (folder / "seaweedfs").mkdir()
+    with seaweed.running(folder / "seaweedfs") as server:
+        yield server
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,6 @@
 """A small room, a farm of real processes on this machine, and the `lightkiln` command as a user types it."""
 
+import hashlib
 import json
 import os
 import signal
@@ -91,6 +92,12 @@ def wait_until(what: str, check: Callable[[], Any], timeout: float = 180.0) -> A
     raise AssertionError(f"waited {timeout} s in vain: {what}")
 
 
+def digests(folder: Path) -> dict[str, str]:
+    """sha256 of everything in a package that must not depend on when or where it was made."""
+    files = [p for p in folder.iterdir() if p.suffix in (".ktx2", ".exr", ".glb")]
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
 @dataclass
 class Farm:
     """A coordinator and workers as an operator starts them; each can be killed and started again."""
@@ -104,13 +111,13 @@ class Farm:
     def url(self) -> str:
         return f"http://{HOST}:{self.port}"
 
-    def start_coordinator(self) -> None:
+    def start_coordinator(self, *flags: str) -> None:
         if not self.port:
             with socket.socket() as probe:
                 probe.bind((HOST, 0))
                 self.port = probe.getsockname()[1]
         data = self.folder / "data"
-        self._start("coordinator", ["-m", "kiln_service", "--port", str(self.port), "--data", str(data)])
+        self._start("coordinator", ["-m", "kiln_service", "--port", str(self.port), "--data", str(data), *flags])
         wait_until("the coordinator is ready", self._ready)
         self.token = (data / "token").read_text().strip()
 
@@ -156,6 +163,18 @@ class Farm:
     def state(self, job: str) -> str:
         view = self.get(f"/v1/jobs/{job}")
         return str(view["state"]) if view else ""
+
+    def finish(self, job: str) -> None:
+        """Wait until the job has completed."""
+        over = ("completed", "failed", "canceled")
+        state = wait_until("the job ends", lambda: (now := self.state(job)) in over and now, 300)
+        assert state == "completed", self.get(f"/v1/jobs/{job}")
+
+    def download(self, job: str, out: Path) -> Path:
+        """The job's package, through the command line."""
+        done = lightkiln("download", job, "--out", out, "--url", self.url, "--token", self.token)
+        assert done.returncode == 0, done.stderr
+        return out
 
     def stop(self) -> None:
         for process in reversed(self.processes.values()):

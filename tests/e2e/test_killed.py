@@ -2,22 +2,10 @@
 
 from pathlib import Path
 
-from e2e_farm import Farm, lightkiln, settings, threads, wait_until
-from test_bake import digests
+from e2e_farm import Farm, digests, settings, threads, wait_until
 
 SLOW_FIT = ("fit.steps=1500", "fit.checkpoint_s=1")
 """Long enough to be killed between two checkpoints."""
-
-
-def download(farm: Farm, job: str, out: Path) -> Path:
-    done = lightkiln("download", job, "--out", out, "--url", farm.url, "--token", farm.token)
-    assert done.returncode == 0, done.stderr
-    return out
-
-
-def finish(farm: Farm, job: str) -> None:
-    state = wait_until("the job ends", lambda: farm.state(job) in ("completed", "failed") and farm.state(job), 300)
-    assert state == "completed", farm.get(f"/v1/jobs/{job}")
 
 
 def fit_progress(farm: Farm, job: str) -> float:
@@ -33,7 +21,7 @@ def test_killed_processes_change_no_byte(farm: Farm, room_files: tuple[Path, Pat
     # The undisturbed bake.
     farm.start_worker("steady", *flags)
     calm = farm.submit(scene, environment, *settings(*SLOW_FIT))
-    finish(farm, calm)
+    farm.finish(calm)
     farm.processes["steady"].terminate()
     farm.processes["steady"].wait(30)
 
@@ -55,10 +43,10 @@ def test_killed_processes_change_no_byte(farm: Farm, room_files: tuple[Path, Pat
     farm.kill("coordinator")
     farm.start_coordinator()
 
-    finish(farm, job)
+    farm.finish(job)
     farm.processes["second"].terminate()
     farm.processes["second"].wait(30)
-    assert digests(download(farm, job, folder / "disturbed")) == digests(download(farm, calm, folder / "calm"))
+    assert digests(farm.download(job, folder / "disturbed")) == digests(farm.download(calm, folder / "calm"))
 
     # The crashes were real, and the fan-in happened once.
     attempts = {kind: max(task["attempt"] for task in farm.tasks(job, kind)) for kind in ("render", "fit")}

@@ -1,0 +1,31 @@
+"""A farm whose light-field store is in a bucket: the package is the one that a bake on one machine makes."""
+
+from pathlib import Path
+
+import pytest
+import seaweed
+from e2e_farm import Farm, digests, settings
+
+
+def test_a_store_in_a_bucket(
+    s3_server: seaweed.S3Server,
+    room_files: tuple[Path, Path],
+    baked: Path,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, value in s3_server.environment().items():
+        monkeypatch.setenv(name, value)
+    farm = Farm(folder / "farm")
+    farm.folder.mkdir()
+    try:
+        farm.start_coordinator("--store", f"s3://{s3_server.bucket}/light-fields")
+        farm.start_worker("first", "--kinds", "prepare,render", "--threads", "1")
+        farm.start_worker("second", "--kinds", "fit,package", "--threads", "1")
+        job = farm.submit(*room_files, *settings())
+        farm.finish(job)
+        package = farm.download(job, folder / "package")
+    finally:
+        farm.stop()
+    assert digests(package) == digests(baked)
+    assert not (farm.folder / "data" / "store").exists()
