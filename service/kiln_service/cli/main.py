@@ -23,6 +23,7 @@ from kiln_schemas.settings import make_settings
 from kiln_schemas.states import FINAL_JOB_STATES, JobState
 from kiln_service.cli import bake as baking
 from kiln_service.cli import options
+from kiln_service.cli.become import become
 from kiln_service.cli.bundle import collect
 from kiln_service.cli.doctor import examine
 from kiln_service.cli.fetch import download_package
@@ -35,6 +36,7 @@ from kiln_service.cli.output import (
     shown_path,
     stage_table,
 )
+from kiln_service.cli.pictures import add_picture_commands
 from kiln_service.cli.progress import follow, make_display, raise_unless_completed
 from kiln_service.cli.upload import upload_and_submit
 
@@ -50,6 +52,7 @@ app = typer.Typer(
 )
 examples_app = typer.Typer(help="Example scenes.", no_args_is_help=True)
 app.add_typer(examples_app, name="examples")
+add_picture_commands(app)
 
 
 @app.callback(invoke_without_command=True)
@@ -129,7 +132,7 @@ def serve(
     command = ["--host", host, "--port", str(port), "--data", str(data)]
     for flag, value in (("--database", database), ("--store", store), ("--config", config)):
         command += [flag, str(value)] if value is not None else []
-    _become("kiln_service", [*command, *(["--json"] if json else [])])
+    become("kiln_service", [*command, *(["--json"] if json else [])])
 
 
 @app.command()
@@ -155,7 +158,7 @@ def worker(
     flags = (("--token-file", token_file), ("--memory", memory), ("--threads", threads), ("--name", name))
     for flag, value in (*flags, ("--scratch", scratch)):
         command += [flag, str(value)] if value is not None else []
-    _become("kiln_workers", [*command, *(["--json"] if json else [])])
+    become("kiln_workers", [*command, *(["--json"] if json else [])])
 
 
 @app.command()
@@ -335,10 +338,3 @@ def _leave(error: KilnError, *, as_json: bool) -> NoReturn:
 def _interrupt(signum: int, frame: FrameType | None) -> None:
     """SIGTERM is treated as Ctrl-C, so that everything that was started is stopped."""
     raise KeyboardInterrupt
-
-
-def _become(module: str, arguments: list[str]) -> NoReturn:
-    """Turn into `python -m module`: signals, exit code and output are then that process's own."""
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    sys.stdout.flush()
-    os.execv(sys.executable, [sys.executable, "-m", module, *arguments])

@@ -1,7 +1,7 @@
 """A pinhole camera in world space (right-handed, +Y up), as a contract and as rays.
 
-One definition serves the G-buffer, whose rays are computed here, and the path-traced reference, which takes Mitsuba's own
-`perspective` sensor: two derivations that agree only if neither of them mirrors the picture.
+One definition serves the G-buffer, whose rays are computed here, and the path-traced reference, which takes Mitsuba's
+own `perspective` sensor: two derivations that agree only if neither of them mirrors the picture.
 """
 
 from pathlib import Path

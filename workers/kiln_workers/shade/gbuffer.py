@@ -1,7 +1,7 @@
 """The G-buffer: what a deferred renderer's first pass would write, ray-traced by Mitsuba.
 
-Mitsuba says which triangle a ray meets and where; attributes are interpolated here from the scene's own vertices, so the
-light-map coordinates are those of the package's `scene.glb` and nothing has passed through the renderer's idea of UVs.
+Mitsuba says which triangle a ray meets and where; attributes are interpolated here from the scene's own vertices, so
+the light-map coordinates are those of the package's `scene.glb` and nothing has passed through the renderer's UVs.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GBuffer:
-    """The picture's sub-pixel samples [H, W, S]; the surface arrays hold those P of them that met a surface, in order."""
+    """The samples of a picture [H, W, S]; surface arrays hold the P of them that met a surface, in order."""
 
     directions: Float32  # [H, W, S, 3] unit, from the eye
     hit: Bools  # [H, W, S]

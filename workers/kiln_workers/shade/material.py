@@ -1,7 +1,7 @@
 """glTF metallic-roughness materials at surface points, evaluated without the renderer.
 
-Textures are linearised, then filtered bilinearly with their wrap modes (glTF 2.0, section 3.8.4). The renderer evaluates
-the same materials through Mitsuba; agreement of the two is a check of both.
+Textures are linearised, then filtered bilinearly with their wrap modes (glTF 2.0, section 3.8.4). The renderer
+evaluates the same materials through Mitsuba; agreement of the two is a check of both.
 """
 
 from dataclasses import dataclass
@@ -43,9 +43,7 @@ def evaluate(scene: Scene, material: Ints, uv: Floats) -> Reflectance:
     return out
 
 
-def _evaluate_one(
-    scene: Scene, material: Material, uv: Floats, at: npt.NDArray[np.bool_], out: Reflectance
-) -> None:
+def _evaluate_one(scene: Scene, material: Material, uv: Floats, at: npt.NDArray[np.bool_], out: Reflectance) -> None:
     base, glossy = material.base_color_texture, material.metallic_roughness_texture
     colour = 1.0 if base is None else look_up(scene.images[base.image], base, uv)[:, :3]
     out.base_color[at] = np.clip(np.asarray(material.base_color[:3]) * colour, 0.0, 1.0)

@@ -83,7 +83,9 @@ class EnvironmentLookup:
         uv = textures.octahedral_uv(directions)
         out = torch.zeros_like(directions)
         for number in range(len(self.alphas)):
-            weight = torch.where(lower == number, 1.0 - share[:, 0], 0.0) + torch.where(upper == number, share[:, 0], 0.0)
+            weight = torch.where(lower == number, 1.0 - share[:, 0], 0.0) + torch.where(
+                upper == number, share[:, 0], 0.0
+            )
             weight = torch.where(lower == upper, torch.where(upper == number, 1.0, 0.0), weight)
             at = weight > 0.0
             out[at] += weight[at, None] * textures.bilinear(self.u[number], uv[at])

@@ -1,7 +1,6 @@
 """Pictures of a package: the terms of section 6 over a G-buffer, averaged over each pixel's samples."""
 
 from collections.abc import Collection
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
@@ -13,28 +12,9 @@ from kiln_workers.scene.model import Float32
 from kiln_workers.shade import algorithm, textures
 from kiln_workers.shade.gbuffer import GBuffer
 from kiln_workers.shade.package import Incident, ShadePackage
+from kiln_workers.shade.term import WHOLE, Term
 
 POINTS_AT_ONCE: Final = 1 << 16
-
-
-class Term(StrEnum):
-    """A part of a picture; the default picture is the sum of all but UNOCCLUDED."""
-
-    EMISSION = "emission"
-    """What surfaces emit themselves."""
-    DIFFUSE = "diffuse"
-    """The irradiance map on what is not metal."""
-    INTERREFLECTION = "interreflection"
-    """Glossy reflection of the scene: the light field."""
-    ENVIRONMENT = "environment"
-    """Glossy reflection of the environment: U W_E (eq. 8)."""
-    UNOCCLUDED = "unoccluded"
-    """The same without visibility: U alone (eq. 4), for comparison."""
-    BACKGROUND = "background"
-    """The environment where no surface is."""
-
-
-WHOLE: Final = tuple(term for term in Term if term is not Term.UNOCCLUDED)
 
 
 def shade(
@@ -54,7 +34,7 @@ def shade(
     if Term.BACKGROUND in terms and package.environment is not None and not hit.all():
         directions = _tensor(buffer.directions.reshape(-1, 3)[~hit], package.irradiance)
         out[~hit] = package.environment.seen(directions).cpu().numpy()
-    return out.reshape(height, width, samples, 3).mean(axis=2)
+    return np.asarray(out.reshape(height, width, samples, 3).mean(axis=2), np.float32)
 
 
 def _shade_points(

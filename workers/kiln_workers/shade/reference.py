@@ -1,7 +1,7 @@
 """A path-traced picture of a scene, by Mitsuba's own `path` integrator, and how noisy it is.
 
-Independent of the tracer that bakes: only the scene's translation is shared. Two halves with different seeds are rendered;
-the picture is their mean, and half their difference estimates its noise.
+Independent of the tracer that bakes: only the scene's translation is shared. Two halves with different seeds are
+rendered; the picture is their mean, and half their difference estimates its noise.
 """
 
 from dataclasses import dataclass
@@ -23,11 +23,18 @@ class Reference:
     """Two independent pictures of the same camera."""
 
     halves: tuple[Float32, Float32]  # each [H, W, 3]
+    samples: int  # paths a pixel, of both halves together
 
     @property
     def picture(self) -> Float32:
         """The mean of the halves [H, W, 3]."""
         return 0.5 * (self.halves[0] + self.halves[1])
+
+    @property
+    def rms_noise(self) -> float:
+        """Root mean square noise of the picture over its mean: half the difference of the halves estimates it."""
+        noise = 0.5 * (self.halves[0].astype(np.float64) - self.halves[1])
+        return float(np.sqrt(np.mean(np.square(noise))) / max(float(self.picture.mean()), 1e-30))
 
 
 def path_trace(
@@ -77,4 +84,4 @@ def path_trace(
                 picture = mi.render(translated, sensor=sensor, integrator=integrator, spp=count, seed=key)
                 total += count * np.asarray(picture, np.float64)
         halves.append((total / each).astype(np.float32))
-    return Reference((halves[0], halves[1]))
+    return Reference((halves[0], halves[1]), 2 * each)

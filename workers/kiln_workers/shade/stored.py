@@ -1,8 +1,8 @@
-"""Incident light from the light-field store instead of the lobes: what the algorithm would show if the fit were perfect.
+"""Incident light from the light-field store instead of the lobes: the algorithm as it were if the fit were perfect.
 
 The same section 6, with D still an anisotropic Gaussian and F and G still at the specular direction, but the integral
 over the light field a sum over its stored pixels, and W_E looked up in its stored image. What remains against a path
-tracer is the algorithm's error; what the lobes add to it is the fit's. Tiles are read one at a time, so memory is bounded.
+tracer is the algorithm's error; what the lobes add to it is the fit's. Tiles are read one at a time: memory is bounded.
 """
 
 from collections.abc import Iterator
@@ -51,9 +51,10 @@ class StoredImages:
         directions = torch.from_numpy(octahedral.pixel_directions(size).reshape(-1, 3)).to(uv)
         solid_angles = torch.from_numpy(octahedral.pixel_solid_angles(size).reshape(-1, 1).copy()).to(uv)
         out = torch.zeros_like(surface.normal)
+        step = max(1, KERNEL_VALUES // len(directions))
         for image, point, weight in self._texels(Function.LIGHT_FIELD, uv):
             light = image.reshape(-1, 3) * solid_angles
-            for part in torch.arange(len(point), device=uv.device).split(max(1, KERNEL_VALUES // len(directions))):
+            for part in torch.split(torch.arange(len(point), device=uv.device), step):
                 at = point[part]
                 chosen = algorithm.Kernel(
                     *(getattr(kernel, name)[at] for name in ("x", "y", "z", "lx", "ly", "amplitude"))
@@ -82,9 +83,9 @@ class StoredImages:
         texel, weights = texel.ravel()[used], weights.ravel()[used]
         order = texel.argsort(stable=True)
         numbers, counts = torch.unique_consecutive(texel[order], return_counts=True)
-        groups = dict(
-            zip(numbers.tolist(), zip(points[order].split(counts.tolist()), weights[order].split(counts.tolist())))
-        )
+        sizes = counts.tolist()
+        parts = zip(torch.split(points[order], sizes), torch.split(weights[order], sizes), strict=True)
+        groups = dict(zip(numbers.tolist(), parts, strict=True))
         for texels, images in self._tiles(function, np.array(sorted(groups), np.int64)):
             for number, image in zip(texels, images, strict=True):
                 yield torch.from_numpy(image.astype(np.float32)).to(uv.device), *groups[int(number)]
