@@ -27,6 +27,9 @@ TINY = (
 
 HOST = "127.0.0.1"
 
+TIMING = {"heartbeat_s": 1.0, "stale_s": 8.0, "maintenance_s": 1.0}
+"""Of the farm's coordinator, in seconds: a lost worker is noticed sooner than the 30 s of a farm across a network."""
+
 
 def quad(name: str, corner: tuple[float, ...], u: tuple[float, ...], v: tuple[float, ...], material: int) -> Mesh:
     """A parallelogram whose normal is u x v; its chart is the quarter of the light map that `material` numbers."""
@@ -116,8 +119,10 @@ class Farm:
             with socket.socket() as probe:
                 probe.bind((HOST, 0))
                 self.port = probe.getsockname()[1]
-        data = self.folder / "data"
-        self._start("coordinator", ["-m", "kiln_service", "--port", str(self.port), "--data", str(data), *flags])
+        data, config = self.folder / "data", self.folder / "coordinator.json"
+        config.write_text(json.dumps({"timing": TIMING}))
+        where = ["--port", str(self.port), "--data", str(data), "--config", str(config)]
+        self._start("coordinator", ["-m", "kiln_service", *where, *flags])
         wait_until("the coordinator is ready", self._ready)
         self.token = (data / "token").read_text().strip()
 
