@@ -35,6 +35,9 @@ log = logging.getLogger(__name__)
 
 START_TIMEOUT_S: Final = 120.0
 """Crash recovery on a slow disk takes a while."""
+STARTS: Final = 3
+"""A server that was killed, or that still finds children of a killed one, is started again so many times in all."""
+START_PAUSE_S: Final = 1.0
 STOP_TIMEOUT_S: Final = 60.0
 SYSTEM_USER: Final = "pgserver"
 SOCKET_PATH_MAX: Final = 100
@@ -90,7 +93,15 @@ class EmbeddedPostgres:
         self._make_folders()
         if not (self.folder / "PG_VERSION").exists():
             self._make_cluster()
-        self._stop_leftover()
+        for left in reversed(range(STARTS)):
+            self._stop_leftover()
+            self._launch()
+            if self._becomes_ready(may_end=left > 0):
+                return
+            log.warning("the embedded database ended while it started; trying again")
+            time.sleep(START_PAUSE_S)
+
+    def _launch(self) -> None:
         with self.log_file.open("ab") as output:
             self._process = subprocess.Popen(
                 [str(self._bin / "postgres"), "-D", str(self.folder), "-k", str(self._sockets), *self._flags()],
@@ -101,7 +112,6 @@ class EmbeddedPostgres:
                 preexec_fn=_stop_with_parent if sys.platform == "linux" else None,
                 **self._identity(),
             )
-        self._wait_until_ready()
 
     def stop(self) -> None:
         """Stop the server cleanly (PostgreSQL's fast shutdown); kill it only if it does not."""
@@ -175,14 +185,17 @@ class EmbeddedPostgres:
         for file in lock_files:
             file.unlink(missing_ok=True)
 
-    def _wait_until_ready(self) -> None:
+    def _becomes_ready(self, *, may_end: bool) -> bool:
+        """Wait until the server answers; False if it ended instead and that `may_end` be, else MachineLacks."""
         deadline = time.monotonic() + START_TIMEOUT_S
         while True:
             try:
                 psycopg.connect(self.dsn, connect_timeout=5).close()
-                return
+                return True
             except psycopg.OperationalError as error:
                 gone = not self.alive()
+                if gone and may_end:
+                    return False
                 if gone or time.monotonic() > deadline:
                     self.stop()
                     reason = _tail(self.log_file.read_text(errors="replace")) if gone else str(error)

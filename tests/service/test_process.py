@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from kiln_schemas.errors import MachineLacks
 from kiln_service.embedded import EmbeddedPostgres
 
 WORKER = {"name": "w", "kinds": ["prepare"], "memory_bytes": 1, "threads": 1, "device": "none", "version": "0"}
@@ -180,6 +182,28 @@ def test_a_server_that_was_left_behind_is_replaced(folder):
     with EmbeddedPostgres(folder / "postgres") as server:
         assert server.alive() and not left.alive()
         assert len(servers_of(folder)) == 1
+
+
+def test_a_server_killed_while_it_starts_is_started_again(folder):
+    server = EmbeddedPostgres(folder / "postgres")
+    first: list[int] = []
+
+    def kill_the_first() -> None:
+        while server._process is None:
+            time.sleep(0.001)
+        first.append(server._process.pid)
+        server._process.kill()
+
+    killer = threading.Thread(target=kill_the_first)
+    killer.start()
+    with server:
+        killer.join()
+        assert server.alive() and servers_of(folder) != first
+
+
+def test_a_server_that_cannot_start_is_a_sentence(folder):
+    with pytest.raises(MachineLacks, match=r"does not start.*no_such_setting"):
+        EmbeddedPostgres(folder / "postgres", {"no_such_setting": "1"}).start()
 
 
 def test_the_coordinator_loads_no_renderer_and_no_arrays():
