@@ -23,7 +23,7 @@ from typing import Any, Final
 import uvicorn
 from fastapi import FastAPI
 
-from kiln_schemas.errors import Conflict, InputError, KilnError, MachineLacks
+from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, MachineLacks
 from kiln_service.app import create_app
 from kiln_service.auth import TOKEN_FILE
 from kiln_service.config import ServiceConfig, make_config
@@ -116,7 +116,12 @@ def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json:
         with _quiet_signals():
             asyncio.run(server.serve_all([listening]))
     if server.lost_database:
-        raise MachineLacks("the embedded database stopped", where=str(config.data), remedy="See postgres.log there.")
+        # Not MachineLacks: whoever supervises us must not take it for something that a restart does not mend.
+        raise InternalError(
+            "the embedded database stopped",
+            where=str(config.data),
+            remedy="Start the coordinator again; postgres.log there tells more.",
+        )
     if not server.started:
         raise MachineLacks("the coordinator could not start", remedy="Its log on standard error says why.")
     return 0

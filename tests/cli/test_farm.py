@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
 
 from kiln_schemas.errors import AuthError, InternalError
@@ -44,6 +45,18 @@ def test_a_coordinator_killed_with_9_comes_back_with_its_jobs(coordinator) -> No
         coordinator.farm.revive()
         assert api.jobs() == before
         assert coordinator.farm.coordinator.pid not in (None, pid)
+
+
+def test_a_killed_database_comes_back_with_its_coordinator_and_their_jobs(coordinator) -> None:
+    with Api(coordinator.url, coordinator.farm.token, patience_s=60) as api:
+        before = api.jobs()
+        pid = coordinator.farm.coordinator.pid
+        assert pid is not None
+        (database,) = [p for p in psutil.Process(pid).children() if p.name() == "postgres"]
+        database.kill()
+        wait_until(lambda: not running(pid))
+        coordinator.farm.revive()
+        assert api.jobs() == before
 
 
 def test_a_killed_process_is_started_again_and_stopped_in_the_end(tmp_path: Path) -> None:

@@ -52,7 +52,6 @@ app = typer.Typer(
 )
 examples_app = typer.Typer(help="Example scenes.", no_args_is_help=True)
 app.add_typer(examples_app, name="examples")
-add_picture_commands(app)
 
 
 @app.callback(invoke_without_command=True)
@@ -308,6 +307,9 @@ def examples_write(
         print_json({"files": files})
     else:
         results.print("\n".join(files), markup=False, soft_wrap=True)
+
+
+add_picture_commands(app)
 
 
 def main() -> NoReturn:
