@@ -23,6 +23,8 @@ A message names the place (mesh, file, field), the value and the remedy.
 import errno
 from typing import ClassVar, Final, Self
 
+from pydantic import ValidationError
+
 from kiln_schemas.base import Contract
 
 DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -147,3 +149,15 @@ class MachineLacks(KilnError):
 
 class InternalError(KilnError):
     code, title, status, exit_code, retryable = "internal", "A defect in lightkiln", 500, 1, True
+
+
+def error_of_answer(body: bytes, status: int, request: str, where: str) -> KilnError:
+    """The exception that an HTTP answer stands for; InternalError where it is not one of a coordinator's."""
+    try:
+        return KilnError.from_problem(Problem.model_validate_json(body))
+    except ValidationError:
+        return InternalError(
+            f"unexpected answer {status} to {request}",
+            where=where,
+            remedy="Check that this URL is a lightkiln coordinator.",
+        )

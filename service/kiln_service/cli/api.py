@@ -4,7 +4,6 @@ Repeats a call while the coordinator does not answer, up to `patience_s`; errors
 exceptions of their code (`kiln_schemas.errors`).
 """
 
-import contextlib
 import hashlib
 import re
 import time
@@ -15,9 +14,9 @@ from typing import Any, Final, Self
 from urllib.parse import quote
 
 import httpx
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
-from kiln_schemas.errors import AuthError, InternalError, KilnError, Problem, Unreachable
+from kiln_schemas.errors import AuthError, Unreachable, error_of_answer
 from kiln_schemas.job import JobPage, JobRequest, JobView, MissingReply, MissingRequest, TaskView
 from kiln_schemas.tasks import Artifact, TaskKind
 
@@ -143,7 +142,8 @@ class Api:
                 if response.is_success:
                     return response
                 if response.status_code not in AWAY:
-                    raise problem_of(response)
+                    asked = f"{response.request.method} {response.request.url.path}"
+                    raise error_of_answer(response.content, response.status_code, asked, self.url)
                 reason = f"it answers {response.status_code}"
             if time.monotonic() + pause > deadline:
                 raise Unreachable(
@@ -153,21 +153,6 @@ class Api:
                 )
             time.sleep(pause)
             pause = min(2 * pause, PAUSE_S[1])
-
-
-def problem_of(response: httpx.Response) -> KilnError:
-    """The exception that an answer stands for."""
-    document: Any = None
-    with contextlib.suppress(ValueError):
-        document = response.json()
-    try:
-        return KilnError.from_problem(Problem.model_validate(document))
-    except ValidationError:
-        return InternalError(
-            f"unexpected answer {response.status_code} to {response.request.method} {response.request.url.path}",
-            where=str(response.request.url.host),
-            remedy="Check that this URL is a lightkiln coordinator.",
-        )
 
 
 def _pieces(path: Path, on_bytes: OnBytes) -> Iterator[bytes]:

@@ -6,7 +6,6 @@ commits of the same attempt are idempotent, blobs are addressed by their content
 `application/problem+json` is raised as the exception of that code (`kiln_schemas.errors`).
 """
 
-import contextlib
 import hashlib
 import math
 import random
@@ -15,13 +14,12 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import httpx
-from pydantic import ValidationError
 
 from kiln_schemas.base import Contract
-from kiln_schemas.errors import InternalError, KilnError, Problem, Unreachable
+from kiln_schemas.errors import Unreachable, error_of_answer
 from kiln_schemas.job import MissingReply
 from kiln_schemas.tasks import (
     Checkpoint,
@@ -169,7 +167,8 @@ class CoordinatorClient:
                 if response.is_success:
                     return response
                 if response.status_code not in AWAY and response.status_code != httpx.codes.INTERNAL_SERVER_ERROR:
-                    raise _error(response)
+                    asked = f"{response.request.method} {response.request.url.path}"
+                    raise error_of_answer(response.content, response.status_code, asked, self.url)
                 reason = f"it answers {response.status_code}"
                 bound = patience if response.status_code in AWAY else min(patience, DEFECT_PATIENCE_S)
             if time.monotonic() - began >= bound or self._stop.is_set():
@@ -192,18 +191,3 @@ def _chunks(source: bytes | Path) -> Iterator[bytes]:
     with source.open("rb") as file:
         while chunk := file.read(CHUNK):
             yield chunk
-
-
-def _error(response: httpx.Response) -> KilnError:
-    """The exception that the coordinator's answer stands for."""
-    document: Any = None
-    with contextlib.suppress(ValueError):
-        document = response.json()
-    try:
-        return KilnError.from_problem(Problem.model_validate(document))
-    except ValidationError:
-        return InternalError(
-            f"unexpected answer {response.status_code} to {response.request.method} {response.request.url.path}",
-            where=str(response.request.url.copy_with(path="/", query=None)),
-            remedy="Check that this URL is a lightkiln coordinator.",
-        )
