@@ -3,11 +3,11 @@
 import numpy as np
 import torch
 
-from kiln_workers.render.environment import cube_directions
-from kiln_workers.scene.model import Image, TextureRef
+from kiln_workers.render.environment import cube_directions, environment_samples, environment_u
+from kiln_workers.scene.model import Environment, Image, TextureRef
 from kiln_workers.shade import material, textures
 from kiln_workers.shade.package import EnvironmentLookup
-from kiln_workers.sphere import octahedral
+from kiln_workers.sphere import ggx, octahedral
 
 
 def slow_bilinear(image: np.ndarray, u: float, v: float) -> np.ndarray:
@@ -49,13 +49,35 @@ def test_a_cube_map_has_its_own_texels_where_the_packager_says() -> None:
     np.testing.assert_allclose(found, faces.reshape(-1, 3), atol=1e-9)
 
 
-def test_u_is_linear_between_the_layers_that_enclose_alpha() -> None:
-    layers = torch.tensor([1.0, 3.0, 7.0])[:, None, None, None].expand(3, 4, 4, 3)
-    look_up = EnvironmentLookup(layers, torch.tensor([0.1, 0.2, 0.6]), torch.zeros(6, 1, 1, 3))
+def test_u_between_layers_is_exact_for_powers_of_alpha() -> None:
+    """U of a small light goes as alpha^-2 towards it and as alpha^2 away from it."""
+    alphas = torch.tensor([0.1, 0.2, 0.6])
+    layers = torch.stack([alphas**-2, alphas**2, torch.zeros(3)], dim=-1)[:, None, None].expand(3, 4, 4, 3)
+    look_up = EnvironmentLookup(layers, alphas, torch.zeros(6, 1, 1, 3))
     alpha = torch.tensor([0.05, 0.1, 0.15, 0.2, 0.3, 0.6, 0.9])
     directions = torch.nn.functional.normalize(torch.randn(7, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
-    found = look_up.convolved(directions, alpha)[:, 0].numpy()
-    np.testing.assert_allclose(found, [1.0, 1.0, 2.0, 3.0, 4.0, 7.0, 7.0], rtol=1e-5)
+    found = look_up.convolved(directions, alpha).numpy()
+    expected = np.clip(alpha.numpy().astype(np.float64), 0.1, 0.6)
+    np.testing.assert_allclose(found[:, 0], expected**-2, rtol=1e-4)
+    np.testing.assert_allclose(found[:, 1], expected**2, rtol=1e-4)
+    assert found[:, 2].max() <= 2e-6
+
+
+def test_u_near_a_small_sun_is_the_sum_over_the_image() -> None:
+    """A sun of one pixel off every grid's centres: each lobe within 7 % of the sum over the environment's pixels."""
+    pixels = np.full((256, 512, 3), 0.2, np.float32)
+    pixels[70, 333] = 8000.0
+    alphas = np.array([0.09, 0.16, 0.36])
+    layers, _ = environment_u(Environment(pixels), alphas, 32, "cpu")
+    samples = environment_samples(Environment(pixels), 1)
+    energy = samples.radiance * samples.solid_angle[:, None]
+    sun = samples.direction[70 * 512 + 333]
+    directions = octahedral.pixel_directions(32)
+    near = directions[directions @ sun > 0.9]
+    for layer, alpha in zip(layers, alphas, strict=True):
+        cosine = near @ samples.direction.T
+        exact = np.where(cosine > 0.0, ggx.distribution(np.sqrt(0.5 * (1.0 + cosine)), alpha), 0.0) @ energy
+        np.testing.assert_allclose(layer[directions @ sun > 0.9], exact, rtol=0.07)
 
 
 def test_material_textures_wrap_and_transform() -> None:

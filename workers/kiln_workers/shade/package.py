@@ -75,21 +75,20 @@ class EnvironmentLookup:
     mirror: Tensor  # [6, S, S, 3] the sharpest mip of the cube map
 
     def convolved(self, directions: Tensor, alpha: Tensor) -> Tensor:
-        """U(direction, alpha) [P, 3], linear between the layers that enclose alpha [P]."""
+        """U(direction, alpha) [P, 3]: linear in the logarithms of U and alpha between the layers that enclose it."""
         upper = torch.searchsorted(self.alphas, alpha.contiguous()).clamp(max=len(self.alphas) - 1)
         lower = (upper - 1).clamp(min=0)
-        span = (self.alphas[upper] - self.alphas[lower]).clamp(min=1e-12)
-        share = ((alpha - self.alphas[lower]) / span).clamp(0.0, 1.0)[:, None]
+        span = torch.log2(self.alphas[upper] / self.alphas[lower]).clamp(min=1e-12)
+        share = (torch.log2(alpha.clamp(min=1e-6) / self.alphas[lower]) / span).clamp(0.0, 1.0)[:, None]
         uv = textures.octahedral_uv(directions)
-        out = torch.zeros_like(directions)
-        for number in range(len(self.alphas)):
-            weight = torch.where(lower == number, 1.0 - share[:, 0], 0.0) + torch.where(
-                upper == number, share[:, 0], 0.0
-            )
-            weight = torch.where(lower == upper, torch.where(upper == number, 1.0, 0.0), weight)
-            at = weight > 0.0
-            out[at] += weight[at, None] * textures.bilinear(self.u[number], uv[at])
-        return out
+        ends = []
+        for layer in (lower, upper):
+            found = torch.zeros_like(directions)
+            for number in torch.unique(layer).tolist():
+                at = layer == number
+                found[at] = textures.bilinear(self.u[number], uv[at])
+            ends.append(torch.log2(found.clamp(min=1e-6)))
+        return torch.exp2(torch.lerp(ends[0], ends[1], share))
 
     def seen(self, directions: Tensor) -> Tensor:
         """The environment itself [P, 3] in directions [P, 3], as sharp as the package holds it."""

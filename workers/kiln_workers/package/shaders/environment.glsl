@@ -15,17 +15,18 @@ vec2 lkOctahedral(vec3 direction) {
   return 0.5 + 0.5 * (p.z < 0.0 ? fold : p.xy);
 }
 
-// U(direction, alpha), linear between the two layers whose alphas (ascending) enclose it.
+// U(direction, alpha) between the two layers whose alphas (ascending) enclose it: linear in the logarithms of both,
+// because near a small light U falls as a power of alpha, and away from it rises as one.
 vec3 lkEnvironmentU(sampler2DArray u, float alphas[LK_MAX_U_LAYERS], int count, vec3 direction, float alpha) {
   vec2 at = lkOctahedral(direction);
   int upper = 0;
   while (upper < count - 1 && alphas[upper] < alpha) upper++;
   int lower = max(upper - 1, 0);
-  float span = alphas[upper] - alphas[lower];
-  float t = span > 0.0 ? clamp((alpha - alphas[lower]) / span, 0.0, 1.0) : 0.0;
+  float span = log2(alphas[upper] / alphas[lower]);
+  float t = span > 0.0 ? clamp(log2(max(alpha, 1e-6) / alphas[lower]) / span, 0.0, 1.0) : 0.0;
   vec3 below = texture(u, vec3(at, float(lower))).rgb;
   vec3 above = texture(u, vec3(at, float(upper))).rgb;
-  return mix(below, above, t);
+  return exp2(mix(log2(max(below, 1e-6)), log2(max(above, 1e-6)), t));
 }
 
 // The mean of the environment under the GGX lobe about `direction`, for perceptual roughness.
