@@ -63,7 +63,8 @@ class FitSettings(Contract):
     """Training of the network that turns light-field images into lobes."""
 
     lobes: int = Field(ge=1, le=64, description="spherical Gaussians per texel")
-    steps: int = Field(ge=1, le=1_000_000, description="optimiser steps per network")
+    steps: int = Field(ge=1, le=1_000_000, description="optimiser steps of the light field's network")
+    visibility_steps: int = Field(default=1000, ge=1, le=1_000_000, description="of the visibility's: it is far easier")
     batch: int = Field(default=32, ge=1, le=1024, description="texels per step")
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
     window: int = Field(default=4096, ge=1, le=1_000_000, description="texels in the shuffle window")
@@ -91,21 +92,21 @@ PRESETS: Final[Mapping[str, BakeSettings]] = {
     "draft": BakeSettings(
         preset="draft",
         lightmap=LightmapSettings(resolution=32, tile=8),
-        render=RenderSettings(image_size=32, samples=16, irradiance_samples=512),
-        fit=FitSettings(lobes=8, steps=1000),
+        render=RenderSettings(image_size=32, samples=32, irradiance_samples=512),
+        fit=FitSettings(lobes=8, steps=1000, visibility_steps=500),
         package=PackageSettings(environment_size=64),
     ),
     "preview": BakeSettings(
         preset="preview",
         lightmap=LightmapSettings(resolution=64),
-        render=RenderSettings(image_size=64, samples=32),
+        render=RenderSettings(image_size=64, samples=128),
         fit=FitSettings(lobes=16, steps=2500),
     ),
     "production": BakeSettings(
         preset="production",
         lightmap=LightmapSettings(resolution=512),
-        render=RenderSettings(image_size=128, samples=64, irradiance_samples=4096, max_depth=8),
-        fit=FitSettings(lobes=16, steps=60_000),
+        render=RenderSettings(image_size=128, samples=128, irradiance_samples=4096, max_depth=8),
+        fit=FitSettings(lobes=16, steps=60_000, visibility_steps=24_000),
         package=PackageSettings(environment_size=256),
     ),
 }

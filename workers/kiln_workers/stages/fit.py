@@ -1,5 +1,6 @@
 """Fit one function: stream the rendered tiles through the network until it is trained."""
 
+from kiln_schemas.settings import Function
 from kiln_schemas.tasks import FitPayload, FitResult, Progress
 from kiln_workers.fit.source import StoreSource
 from kiln_workers.fit.train import train
@@ -22,16 +23,19 @@ def run(payload: FitPayload, context: Context) -> FitResult:
     def on_progress(at: Progress) -> None:
         context.progress(at.done, at.total, at.unit, at.message, at.loss)
 
+    settings = payload.settings.fit
+    if payload.function is Function.VISIBILITY:
+        settings = settings.model_copy(update={"steps": settings.visibility_steps})
     outcome = train(
         source,
-        payload.settings.fit,
+        settings,
         payload.function,
         payload.settings.seed,
         threads=context.threads,
         checkpoint=checkpoint,
         on_checkpoint=context.checkpoint,
         on_progress=on_progress,
-        checkpoint_every_s=payload.settings.fit.checkpoint_s,
+        checkpoint_every_s=settings.checkpoint_s,
     )
     context.log(f"{payload.function.value}: log_mse_rel {outcome.metrics.log_mse_rel:.4f}")
     return FitResult(
