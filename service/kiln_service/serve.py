@@ -94,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _serve(config, database, as_json=arguments.json)
     except KilnError as error:
         if arguments.json:
-            print(json.dumps({"error": error.problem().model_dump(mode="json")}), flush=True)
+            print(error.problem().model_dump_json(), flush=True)
         print(f"lightkiln: {error}", file=sys.stderr)
         return error.exit_code
 
@@ -113,7 +113,8 @@ def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json:
             announce,
             database,
         )
-        with _quiet_signals():
+        # uvicorn ends the process where the application does not start; the sentence below is ours.
+        with _quiet_signals(), contextlib.suppress(SystemExit):
             asyncio.run(server.serve_all([listening]))
     if server.lost_database:
         # Not MachineLacks: whoever supervises us must not take it for something that a restart does not mend.
@@ -123,7 +124,9 @@ def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json:
             remedy="Start the coordinator again; postgres.log there tells more.",
         )
     if not server.started:
-        raise MachineLacks("the coordinator could not start", remedy="Its log on standard error says why.")
+        raise MachineLacks(
+            "the coordinator could not start", remedy="Check --database; the log on standard error says more."
+        )
     return 0
 
 

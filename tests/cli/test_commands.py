@@ -47,6 +47,25 @@ def test_a_missing_environment_is_named(lightkiln, lit_glb: Path) -> None:
     assert ran.code == 3 and "sky.exr: there is no such environment file" in ran.err
 
 
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--env-scale", "-1"], "--env-scale: -1.0 is refused"),
+        (["--env-scale", "nan"], "--env-scale: nan is refused"),
+        (["--env-rotation", "inf"], "--env-rotation: inf is refused"),
+    ],
+)
+def test_an_environment_out_of_bounds(lightkiln, lit_glb: Path, flags: list[str], words: str) -> None:
+    lit_glb.with_name("sky.exr").write_bytes(b"sky")
+    ran = lightkiln("bake", lit_glb, "--env", lit_glb.with_name("sky.exr"), *flags, "--out", "out")
+    assert ran.code == 3 and words in ran.err
+
+
+def test_an_out_that_is_a_file(lightkiln, lit_glb: Path) -> None:
+    ran = lightkiln("bake", lit_glb, "--out", lit_glb)
+    assert ran.code == 3 and "is not a folder" in ran.err and lit_glb.is_file()
+
+
 def test_errors_as_json(lightkiln) -> None:
     ran = lightkiln("bake", "nowhere.glb", "--out", "out", "--json")
     assert (ran.code, ran.err) == (3, "")

@@ -138,5 +138,5 @@ def test_local_workers_share_the_cores_and_the_memory() -> None:
 def test_a_problem_line_is_found_among_other_lines(tmp_path: Path) -> None:
     problem = AuthError("no").problem().model_dump(mode="json")
     process = managed(tmp_path, "")
-    process.log.write_text(f"noise\n{json.dumps({'error': problem})}\nlightkiln: no\n")
+    process.log.write_text(f"noise\n{json.dumps(problem)}\nlightkiln: no\n")
     assert isinstance(process.last_words(6), AuthError)

@@ -139,7 +139,7 @@ def test_a_second_coordinator_on_the_same_folder_is_refused(folder):
             timeout=30,
         )
     assert second.returncode == 4 and "another coordinator" in second.stderr and "Traceback" not in second.stderr
-    assert json.loads(second.stdout)["error"]["code"] == "conflict"
+    assert json.loads(second.stdout)["code"] == "conflict"
 
 
 @pytest.mark.parametrize(
@@ -155,6 +155,19 @@ def test_bad_arguments_are_sentences(folder, arguments, code, word):
     command = [argument.format(folder=folder) for argument in arguments]
     done = subprocess.run([sys.executable, "-m", "kiln_service", *command], capture_output=True, text=True, timeout=30)
     assert done.returncode == code and word in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_database_that_does_not_answer_is_a_sentence(folder):
+    arguments = ["--data", str(folder), "--port", "0", "--json", "--database", f"host={folder}/nowhere"]
+    config = folder / "config.json"
+    config.write_text(json.dumps({"timing": {"database_s": 1}}))
+    done = subprocess.run(
+        [sys.executable, "-m", "kiln_service", *arguments, "--config", str(config)],
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert done.returncode == 7 and "--database" in json.loads(done.stdout)["remedy"]
 
 
 def test_a_port_that_is_taken_is_a_sentence(shared, folder):

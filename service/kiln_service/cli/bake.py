@@ -94,6 +94,8 @@ class Summary(Contract):
 def bake(options: BakeOptions) -> Summary:
     """Bake; the summary of what is in `options.out`."""
     began = time.monotonic()
+    if options.out.exists() and not options.out.is_dir():
+        raise InputError("is not a folder", where=str(options.out), remedy="Choose another --out.")
     data = options.out / DATA
     record = _resumed(options, data) if options.resume else _planned(options)
     local = _collect(record)

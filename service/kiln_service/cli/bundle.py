@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote
 
+from pydantic import ValidationError
+
 from kiln_schemas.errors import InputError
 from kiln_schemas.job import check_bundle, check_bundle_path
 from kiln_schemas.tasks import Bundle, EnvironmentRef
@@ -70,7 +72,7 @@ def collect(
     if environment is not None:
         name = _environment_name(folder, environment)
         sources[name] = environment
-        reference = EnvironmentRef(file=name, scale=scale, rotation_deg=rotation_deg)
+        reference = _reference(name, scale, rotation_deg)
     files = {name: sha256_of(path) for name, path in sorted(sources.items())}
     return LocalBundle(check_bundle(Bundle(entry=scene.name, files=files, environment=reference)), sources)
 
@@ -106,6 +108,16 @@ def _environment_name(folder: Path, environment: Path) -> str:
     if real.is_relative_to(folder):
         return check_bundle_path(real.relative_to(folder).as_posix())
     return check_bundle_path(f"environment/{environment.name}")
+
+
+def _reference(name: str, scale: float, rotation_deg: float) -> EnvironmentRef:
+    """The environment with its scale and rotation; InputError where they are out of bounds."""
+    try:
+        return EnvironmentRef(file=name, scale=scale, rotation_deg=rotation_deg)
+    except ValidationError as error:
+        first = error.errors()[0]
+        flag = {"scale": "--env-scale", "rotation_deg": "--env-rotation"}.get(str(first["loc"][0]), "--env")
+        raise InputError(f"{first['input']} is refused: {first['msg']}", where=flag) from None
 
 
 def _joined(referrer: str, reference: str) -> str:

@@ -106,9 +106,7 @@ class Managed:
         """The problem that it wrote before it ended, or its last lines."""
         for line in reversed(self._lines()):
             with suppress(ValueError, ValidationError):
-                document = json.loads(line)
-                problem = document.get("error", document) if isinstance(document, dict) else None
-                return KilnError.from_problem(Problem.model_validate(problem))
+                return KilnError.from_problem(Problem.model_validate_json(line))
         return MachineLacks(f"the {self.name} ended with status {status}: {self._tail()}", remedy=f"See {self.log}.")
 
     def _tail(self) -> str:
