@@ -8,7 +8,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import InputError
@@ -89,6 +89,13 @@ class ServiceConfig(Contract):
     """Database connections."""
     limits: Limits = Limits()
     timing: Timing = Timing()
+
+    @field_validator("store_url", "blob_url")
+    @classmethod
+    def _is_file_or_bucket(cls, url: str | None) -> str | None:
+        if url is not None and not url.startswith(("file:///", "s3://")):
+            raise ValueError("must begin with file:/// or s3://")
+        return url
 
     @property
     def store_base(self) -> str:

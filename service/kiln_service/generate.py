@@ -4,7 +4,6 @@ The files in schemas/generated/ are checked in; a test compares them with what t
 """
 
 import json
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -63,4 +62,4 @@ def _text(document: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    main(*(Path(argument) for argument in sys.argv[1:2]))
+    main()
