@@ -149,7 +149,7 @@ def test_a_second_coordinator_on_the_same_folder_is_refused(folder):
         (["--data", "{folder}", "--port", "70000"], 3, "port"),
         (["--data", "{folder}", "--config", "{folder}/none.json"], 3, "none.json"),
         (["--data", "/proc/nothing"], 7, "/proc/nothing"),
-        (["--store", "ftp://host/stores"], 3, "s3://"),
+        (["--data", "{folder}", "--store", "ftp://host/stores"], 3, "s3://"),
     ],
 )
 def test_bad_arguments_are_sentences(folder, arguments, code, word):
