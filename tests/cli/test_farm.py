@@ -42,7 +42,8 @@ def test_a_coordinator_killed_with_9_comes_back_with_its_jobs(coordinator) -> No
         assert pid is not None
         os.kill(pid, signal.SIGKILL)
         wait_until(lambda: not running(pid))
-        coordinator.farm.revive()
+        # As a bake does: look again and again, and start what ended.
+        wait_until(lambda: coordinator.farm.revive() is None and api.ready(), 90)
         assert api.jobs() == before
         assert coordinator.farm.coordinator.pid not in (None, pid)
 
@@ -55,7 +56,8 @@ def test_a_killed_database_comes_back_with_its_coordinator_and_their_jobs(coordi
         (database,) = [p for p in psutil.Process(pid).children() if p.name() == "postgres"]
         database.kill()
         wait_until(lambda: not running(pid))
-        coordinator.farm.revive()
+        # As a bake does: look again and again, and start what ended.
+        wait_until(lambda: coordinator.farm.revive() is None and api.ready(), 90)
         assert api.jobs() == before
 
 
