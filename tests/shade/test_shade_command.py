@@ -8,12 +8,13 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
+from kiln_schemas.camera import read_camera
 from kiln_schemas.errors import InputError
 from kiln_workers.__main__ import main
 from kiln_workers.package.exr import write_rgb
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.scene.model import Scene
-from kiln_workers.shade.camera import read_camera
+from kiln_workers.shade.camera import pixel_directions
 from kiln_workers.shade.package import ShadePackage, read_exr
 
 CAMERA = "--camera=0.4,0.9,2.6:0,0.35,-0.4:45"
@@ -25,7 +26,7 @@ def test_cameras(tmp_path: Path) -> None:
     file = tmp_path / "camera.json"
     file.write_text(camera.model_dump_json())
     assert read_camera(str(file)) == camera
-    ahead = read_camera("0,0,0:0,0,-5:90").directions(3, 3, 1)[:, :, 0]
+    ahead = pixel_directions(read_camera("0,0,0:0,0,-5:90"), 3, 3, 1)[:, :, 0]
     np.testing.assert_allclose(ahead[1, 1], [0, 0, -1], atol=1e-12)
     assert ahead[1, 2, 0] > 0.0 and ahead[0, 1, 1] > 0.0  # right is +X, the first row is the top
     np.testing.assert_allclose(np.degrees(np.arctan(ahead[0, 1, 1] / -ahead[0, 1, 2])), np.degrees(np.arctan(2 / 3)))

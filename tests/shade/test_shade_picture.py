@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from kiln_schemas.camera import Camera
 from kiln_schemas.errors import InputError
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.scene.model import Scene
 from kiln_workers.shade import algorithm, textures
-from kiln_workers.shade.camera import Camera
 from kiln_workers.shade.gbuffer import render_gbuffer
 from kiln_workers.shade.package import LobeTextures
 from kiln_workers.shade.picture import shade

@@ -10,13 +10,13 @@ from typing import Any
 
 import torch
 
+from kiln_schemas.camera import read_camera
 from kiln_schemas.errors import InputError
 from kiln_workers.package import colour
 from kiln_workers.render.backend import select_variant
 from kiln_workers.scene.environment import read_environment
 from kiln_workers.scene.load import check_light, load_scene
 from kiln_workers.scene.model import Environment, Scene
-from kiln_workers.shade.camera import read_camera
 from kiln_workers.shade.gbuffer import render_gbuffer
 from kiln_workers.shade.image_files import check_output, psnr, write_picture
 from kiln_workers.shade.package import ShadePackage, read_exr

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from kiln_schemas.camera import Camera
 from kiln_workers.render.backend import Device, select_variant
 from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.mitsuba_scene import mesh_number
 from kiln_workers.render.paths import PathTracer
 from kiln_workers.scene.model import Float32, Mesh, Scene
 from kiln_workers.shade import material
-from kiln_workers.shade.camera import Camera
+from kiln_workers.shade.camera import pixel_directions
 
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -47,7 +48,7 @@ def render_gbuffer(
 ) -> GBuffer:
     """The G-buffer of a scene whose meshes have light-map UVs, with `grid`^2 samples a pixel."""
     select_variant(device)
-    directions = camera.directions(width, height, grid).astype(np.float32)
+    directions = pixel_directions(camera, width, height, grid).astype(np.float32)
     flat = directions.reshape(-1, 3)
     tracer = PathTracer(scene, max_depth=0)
     ray = mi.Ray3f(mi.Point3f(*camera.position), mi.Vector3f(np.ascontiguousarray(flat.T)))

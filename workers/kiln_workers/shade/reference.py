@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kiln_schemas.camera import Camera
 from kiln_workers.render.backend import Device, select_variant
 from kiln_workers.render.jit import mi
 from kiln_workers.render.mitsuba_scene import to_mitsuba
 from kiln_workers.scene.model import Float32, Scene
-from kiln_workers.shade.camera import Camera
 
 SAMPLES_A_PASS = 1 << 24
 """Paths of one wavefront: bounds the memory."""
