@@ -12,6 +12,7 @@
     |   `-- IllegalTransition
     |-- BakeFailed          a task failed for good (exit 4)
     |   `-- FitFailed       the network did not beat P = 0, or has no signal to learn from
+    |-- GateFailed          the package is there, but misses a quality gate (422, exit 8)
     |-- Canceled            stopped on request (exit 5)
     |-- Unreachable         the coordinator does not answer (503, exit 6)
     |-- MachineLacks        libLLVM, disk, memory, database: what `lightkiln doctor` tells (507, exit 7)
@@ -133,6 +134,10 @@ class BakeFailed(KilnError):
 
 class FitFailed(BakeFailed):
     code, title = "fit-failed", "The fit does not represent the data"
+
+
+class GateFailed(KilnError):
+    code, title, status, exit_code = "gate-failed", "The package misses a quality gate", 422, 8
 
 
 class Canceled(KilnError):

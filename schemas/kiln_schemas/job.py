@@ -7,6 +7,7 @@ from pydantic import Field
 
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import InputError, Problem
+from kiln_schemas.gates import Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Bundle, Progress, Sha256, TaskKind
@@ -20,6 +21,9 @@ class JobRequest(Contract):
     preset: str | None = None
     set: tuple[str, ...] = Field(default=(), max_length=256)
     settings: BakeSettings | None = None
+    gates: Gates = Gates()
+    cameras: Cameras = Field(default_factory=dict)
+    """By name; those that a FLIP gate names are shaded and path-traced."""
 
 
 class StageView(Contract):
@@ -50,6 +54,10 @@ class JobView(Contract):
     """Estimate from the finished tasks; None until there is something to estimate from."""
     notes: tuple[str, ...] = ()
     error: Problem | None = None
+    gates: Gates = Gates()
+    cameras: Cameras = Field(default_factory=dict)
+    gate_results: tuple[GateResult, ...] = ()
+    """Empty until the package has been measured."""
 
 
 class JobPage(Contract):

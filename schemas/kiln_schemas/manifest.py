@@ -5,6 +5,7 @@ from typing import Any
 from pydantic import Field
 
 from kiln_schemas.base import Contract
+from kiln_schemas.gates import GateResult
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.tasks import Artifact, EnvironmentRef, FitMetrics, Sha256
 
@@ -33,6 +34,8 @@ class Manifest(Contract):
     exposure: dict[str, float]
     """Factor per function by which radiance was multiplied before the loss; amplitudes are in scene units again."""
     metrics: ManifestMetrics
+    gates: tuple[GateResult, ...] = ()
+    """The quality gates that the job stated, measured."""
     left_out: dict[str, str] = Field(default_factory=dict)
     """Artifact or function to the reason why it is absent."""
     textures: dict[str, dict[str, Any]]

@@ -1,7 +1,8 @@
 """States of jobs and tasks and the only moves between them.
 
 Tasks: waiting > queued > active > completed | failed | canceled; a lost or failed attempt moves
-active > queued (retry). Jobs: queued > active > completed | failed, or cancel-requested > canceled.
+active > queued (retry). Jobs: queued > active > completed | gate-failed | failed, or
+cancel-requested > canceled.
 """
 
 from collections.abc import Mapping
@@ -25,7 +26,9 @@ class JobState(StrEnum):
     FAILED = "failed"
     """A task failed for good; its error is the job's. Final."""
     COMPLETED = "completed"
-    """All artifacts are published. Final."""
+    """All artifacts are published, and every quality gate is met. Final."""
+    GATE_FAILED = "gate-failed"
+    """All artifacts are published, but the package misses a quality gate; the error says which. Final."""
 
 
 class TaskState(StrEnum):
@@ -47,11 +50,12 @@ class TaskState(StrEnum):
 
 JOB_TRANSITIONS: Final[Mapping[JobState, frozenset[JobState]]] = {
     JobState.QUEUED: frozenset({JobState.ACTIVE, JobState.CANCEL_REQUESTED, JobState.FAILED}),
-    JobState.ACTIVE: frozenset({JobState.COMPLETED, JobState.FAILED, JobState.CANCEL_REQUESTED}),
+    JobState.ACTIVE: frozenset({JobState.COMPLETED, JobState.GATE_FAILED, JobState.FAILED, JobState.CANCEL_REQUESTED}),
     JobState.CANCEL_REQUESTED: frozenset({JobState.CANCELED}),
     JobState.CANCELED: frozenset(),
     JobState.FAILED: frozenset(),
     JobState.COMPLETED: frozenset(),
+    JobState.GATE_FAILED: frozenset(),
 }
 
 TASK_TRANSITIONS: Final[Mapping[TaskState, frozenset[TaskState]]] = {
@@ -64,6 +68,8 @@ TASK_TRANSITIONS: Final[Mapping[TaskState, frozenset[TaskState]]] = {
 }
 
 FINAL_JOB_STATES: Final = frozenset(s for s, moves in JOB_TRANSITIONS.items() if not moves)
+PUBLISHED_JOB_STATES: Final = frozenset({JobState.COMPLETED, JobState.GATE_FAILED})
+"""Those in which a job has artifacts."""
 FINAL_TASK_STATES: Final = frozenset(s for s, moves in TASK_TRANSITIONS.items() if not moves)
 
 

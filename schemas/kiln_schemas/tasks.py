@@ -11,6 +11,7 @@ from pydantic import Field
 
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import Problem
+from kiln_schemas.gates import Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings, Function
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -87,6 +88,8 @@ class PackagePayload(Contract):
     fits: tuple["FitResult", ...]
     settings: BakeSettings
     store_url: str
+    gates: Gates = Gates()
+    cameras: Cameras = Field(default_factory=dict)
 
 
 Payload = Annotated[PreparePayload | RenderPayload | FitPayload | PackagePayload, Field(discriminator="kind")]
@@ -162,6 +165,8 @@ class Artifact(Contract):
 class PackageResult(Contract):
     kind: Literal[TaskKind.PACKAGE] = TaskKind.PACKAGE
     artifacts: tuple[Artifact, ...]
+    gates: tuple[GateResult, ...] = ()
+    """One of each gate of the payload, met or not."""
     seconds: float
 
 

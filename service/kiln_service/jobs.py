@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from kiln_schemas.errors import Conflict, InputError, NotFound
+from kiln_schemas.gates import check_gates
 from kiln_schemas.job import JobRequest, check_bundle
 from kiln_schemas.settings import BakeSettings, make_settings
 from kiln_schemas.states import FINAL_JOB_STATES, JobState
@@ -27,9 +28,10 @@ def settings_of(request: JobRequest) -> BakeSettings:
 
 
 async def submit(database: Database, config: ServiceConfig, request: JobRequest, actor: str) -> JobRow:
-    """Accept a job: its settings are valid, its bundle is closed and its files are here."""
+    """Accept a job: its settings and gates are valid, its bundle is closed and its files are here."""
     settings = settings_of(request)
     bundle = check_bundle(request.bundle)
+    gates = check_gates(request.gates, request.cameras)
     async with database.transaction() as tx:
         if absent := await require_blobs(tx, bundle.files.values()):
             names = sorted(f"{path} ({sha256})" for path, sha256 in bundle.files.items() if sha256 in absent)
@@ -44,6 +46,8 @@ async def submit(database: Database, config: ServiceConfig, request: JobRequest,
             method=SG_LIGHTFIELD.name,
             settings=settings,
             bundle=bundle,
+            gates=gates,
+            cameras=request.cameras,
             store_base=config.store_base,
             planned=plan_job(),
             actor=actor,

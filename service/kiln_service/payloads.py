@@ -44,6 +44,8 @@ async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Payload:
                 prepare=await _prepared(tx, job),
                 renders=await _renders(tx, job),
                 fits=tuple(FitResult.model_validate(row["result"]) for row in fits),
+                gates=job.gates,
+                cameras=job.cameras,
             )
 
 

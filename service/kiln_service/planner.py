@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from kiln_schemas.errors import InputError, TooLarge
+from kiln_schemas.gates import VISIBILITY_LOG_MSE_REL, Gates
 from kiln_schemas.settings import BakeSettings, Function
 from kiln_schemas.tasks import PrepareResult, TaskKind
 
@@ -58,12 +59,18 @@ def plan_job() -> list[Planned]:
     return [Planned(TaskKind.PREPARE, "scene", ready=True)]
 
 
-def plan_after_prepare(result: PrepareResult, settings: BakeSettings, most_tiles: int) -> list[Planned]:
+def plan_after_prepare(result: PrepareResult, settings: BakeSettings, gates: Gates, most_tiles: int) -> list[Planned]:
     """Render tasks (ready), fit tasks and the package task (waiting).
 
-    InputError where there is nothing to bake or the tiles do not fit the light map.
+    InputError where there is nothing to bake, the tiles do not fit the light map or a gate has nothing to measure.
     """
     _check_prepared(result, settings, most_tiles)
+    if gates.visibility_log_mse_rel is not None and not result.has_environment:
+        raise InputError(
+            "the scene has no environment, so no visibility is baked",
+            where=f"gates.{VISIBILITY_LOG_MSE_REL}",
+            remedy="Leave the gate out, or pass an environment with --env.",
+        )
     renders = [
         Planned(TaskKind.RENDER, f"tile {tile.row},{tile.column}", {"tile": tile.model_dump(mode="json")}, ready=True)
         for tile in sorted(result.tiles, key=lambda tile: (tile.row, tile.column))

@@ -4,13 +4,15 @@ Each function is one move of the tables in `kiln_schemas.states`; an illegal one
 caller has locked the job and, for a move of a task, the task (`Tx`'s order of locks).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
 from psycopg.types.json import Jsonb
 
+from kiln_schemas.camera import Camera
 from kiln_schemas.errors import IllegalTransition, Problem
+from kiln_schemas.gates import GateResult, Gates, gate_problem
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState, check_job_move, check_task_move
 from kiln_schemas.tasks import Bundle, Result
@@ -32,6 +34,8 @@ async def create_job(
     method: str,
     settings: BakeSettings,
     bundle: Bundle,
+    gates: Gates,
+    cameras: Mapping[str, Camera],
     store_base: str,
     planned: Sequence[Planned],
     actor: str,
@@ -45,6 +49,8 @@ async def create_job(
         method=method,
         settings=Jsonb(settings.model_dump(mode="json")),
         bundle=Jsonb(bundle.model_dump(mode="json")),
+        gates=Jsonb(gates.model_dump(mode="json")),
+        cameras=Jsonb({name: camera.model_dump(mode="json") for name, camera in cameras.items()}),
         store_url=f"{store_base}/{job_id}.zarr",
     )
     job = JobRow.of(row)
@@ -167,6 +173,15 @@ async def move_job(
     told = (detail or {}) | ({"problem": error.model_dump(mode="json")} if error else {})
     await add_event(tx, job.id, f"job.{after.value}", actor, detail=told)
     return replace(job, state=after, error=error or job.error)
+
+
+async def finish_job(tx: Tx, job: JobRow, gates: Sequence[GateResult]) -> None:
+    """active > completed, or > gate-failed where the package misses a gate; its artifacts are published either way."""
+    measured = [gate.model_dump(mode="json") for gate in gates]
+    await tx.run("set_gate_results", id=job.id, results=Jsonb(measured))
+    missed = gate_problem(gates)
+    after = JobState.GATE_FAILED if missed else JobState.COMPLETED
+    await move_job(tx, job, after, COORDINATOR, error=missed, detail={"gates": measured} if measured else None)
 
 
 async def fail_job(tx: Tx, job: JobRow, problem: Problem, actor: str) -> list[int]:

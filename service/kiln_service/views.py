@@ -141,6 +141,9 @@ def _job_view(job: JobRow, rows: dict[str, DictRow]) -> JobView:
         remaining_s=None if job.state in FINAL_JOB_STATES else remaining_seconds(ordered),
         notes=job.notes,
         error=job.error,
+        gates=job.gates,
+        cameras=job.cameras,
+        gate_results=job.gate_results,
     )
 
 

@@ -146,7 +146,7 @@ class Work:
             if _is_repeated(task, commit):
                 return
             _check_fence(task, commit.attempt)
-            _check_result(task, commit.result)
+            _check_result(job, task, commit.result)
             if job.state is not JobState.ACTIVE:
                 stopped = StaleAttempt(f"the job is {job.state}; the result is not wanted", where=task.label)
                 await transitions.cancel_task(tx, task, transitions.COORDINATOR, stopped.detail)
@@ -166,14 +166,14 @@ class Work:
         if isinstance(result, PrepareResult):
             await tx.run("add_notes", id=job.id, notes=Jsonb(list(result.notes)))
             try:
-                planned = plan_after_prepare(result, job.settings, self._config.limits.tiles)
+                planned = plan_after_prepare(result, job.settings, job.gates, self._config.limits.tiles)
             except InputError as error:
                 return await transitions.fail_job(tx, job, error.problem(), transitions.COORDINATOR)
             await transitions.add_tasks(tx, job, planned)
         if isinstance(result, PackageResult):
             for artifact in result.artifacts:
                 await tx.run("add_artifact", job_id=job.id, **artifact.model_dump())
-        await _fan_in(tx, job, task)
+        await _fan_in(tx, job, task, result)
         return []
 
     async def fail(self, task_id: str, failure: Failure) -> None:
@@ -242,13 +242,13 @@ async def _seen(tx: Tx, worker_id: str) -> WorkerRow:
     return worker
 
 
-async def _fan_in(tx: Tx, job: JobRow, task: TaskRow) -> None:
-    """After a completed task: release the next stage, or complete the job, if it was its stage's last."""
+async def _fan_in(tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
+    """After a completed task: release the next stage, or finish the job, if it was its stage's last."""
     if (await tx.one("count_unfinished", job_id=job.id, kind=task.kind))["tasks"]:
         return
     stage = METHODS[job.method].stage_after(task.kind)
     if stage is None:
-        await transitions.move_job(tx, job, JobState.COMPLETED, transitions.COORDINATOR)
+        await transitions.finish_job(tx, job, result.gates if isinstance(result, PackageResult) else ())
         return
     await add_event(tx, job.id, "stage.completed", transitions.COORDINATOR, detail={"kind": task.kind.value})
     for row in await tx.all("tasks_in_state", job_id=job.id, kind=stage, state=TaskState.WAITING):
@@ -272,7 +272,7 @@ def _is_repeated(task: TaskRow, commit: Commit) -> bool:
     )
 
 
-def _check_result(task: TaskRow, result: Result) -> None:
+def _check_result(job: JobRow, task: TaskRow, result: Result) -> None:
     """InputError where the result is not one of this task."""
     if result.kind is not task.kind:
         raise InputError(f"a result of kind '{result.kind}' for a task of kind '{task.kind}'", where="result.kind")
@@ -287,6 +287,9 @@ def _check_result(task: TaskRow, result: Result) -> None:
         names = [artifact.name for artifact in result.artifacts]
         if len(set(names)) < len(names):
             raise InputError("two artifacts have the same name", where="result.artifacts")
+        asked = job.gates.thresholds()
+        if len(result.gates) != len(asked) or {gate.name: gate.threshold for gate in result.gates} != asked:
+            raise InputError("the gates measured are not those that the job states", where="result.gates")
 
 
 def _blobs_of(result: Result) -> list[str]:

@@ -6,7 +6,9 @@ from typing import Any, Self
 
 from psycopg.rows import DictRow
 
+from kiln_schemas.camera import Camera
 from kiln_schemas.errors import Problem
+from kiln_schemas.gates import GateResult, Gates
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Bundle, Progress, TaskKind
@@ -28,6 +30,9 @@ class JobRow(_Row):
     state: JobState
     settings: BakeSettings
     bundle: Bundle
+    gates: Gates
+    cameras: dict[str, Camera]
+    gate_results: tuple[GateResult, ...]
     store_url: str
     notes: tuple[str, ...]
     error: Problem | None
@@ -45,6 +50,9 @@ class JobRow(_Row):
                 "state": JobState(values["state"]),
                 "settings": BakeSettings.model_validate(values["settings"]),
                 "bundle": Bundle.model_validate(values["bundle"]),
+                "gates": Gates.model_validate(values["gates"]),
+                "cameras": {name: Camera.model_validate(tree) for name, tree in values["cameras"].items()},
+                "gate_results": tuple(GateResult.model_validate(tree) for tree in values["gate_results"]),
                 "notes": tuple(values["notes"]),
                 "error": values["error"] and Problem.model_validate(values["error"]),
             }

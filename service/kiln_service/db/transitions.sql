@@ -2,8 +2,8 @@
 
 -- name: insert_job
 -- A new job.
-INSERT INTO jobs (id, name, method, state, settings, bundle, store_url)
-VALUES (%(id)s, %(name)s, %(method)s, 'queued', %(settings)s, %(bundle)s, %(store_url)s)
+INSERT INTO jobs (id, name, method, state, settings, bundle, gates, cameras, store_url)
+VALUES (%(id)s, %(name)s, %(method)s, 'queued', %(settings)s, %(bundle)s, %(gates)s, %(cameras)s, %(store_url)s)
 RETURNING *;
 
 -- name: insert_tasks

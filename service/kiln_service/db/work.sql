@@ -91,6 +91,10 @@ UPDATE tasks SET checkpoint = %(sha256)s, strikes = 0, heartbeat = now() WHERE i
 -- Append to what a job tells its user.
 UPDATE jobs SET notes = notes || %(notes)s WHERE id = %(id)s;
 
+-- name: set_gate_results
+-- What a job's package has of what its gates ask for.
+UPDATE jobs SET gate_results = %(results)s WHERE id = %(id)s;
+
 -- name: add_artifact
 -- Publish an artifact.
 INSERT INTO artifacts (job_id, name, sha256, size, media_type)

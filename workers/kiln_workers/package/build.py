@@ -4,7 +4,7 @@ A pure library: it knows no queue, no store and no network. Every file is writte
 (and an old one goes first), so a folder with a manifest is a whole package.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -32,6 +32,7 @@ from kiln_schemas.tasks import Artifact, FitMetrics, PackagePayload
 from kiln_workers.package import exr, ktx2, report, shaders
 from kiln_workers.package.dilate import Fill, plan_fill
 from kiln_workers.package.files import artifact, write_bytes
+from kiln_workers.package.gates import Judgement, write_gates
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.package.half import lobes_to_layers, to_half
 from kiln_workers.package.preview import PackagePreview
@@ -100,6 +101,10 @@ class PackageInput:
     """Zstandard inside the lobe textures; engines that cannot inflate need plain files."""
 
 
+Judge = Callable[[Path, Manifest], Judgement]
+"""Measures the quality gates on the files that are there, under the manifest as it stands."""
+
+
 @dataclass
 class _Package:
     """The folder being filled."""
@@ -109,6 +114,7 @@ class _Package:
     files: list[Artifact] = field(default_factory=list)
     textures: dict[str, dict[str, Any]] = field(default_factory=dict)
     clamped: int = 0
+    judgement: Judgement = field(default_factory=Judgement)
 
     def add(self, name: str) -> None:
         self.files.append(artifact(self.folder, name))
@@ -136,8 +142,8 @@ class _Package:
         return np.concatenate([rgb, np.ones((*rgb.shape[:-1], 1), np.float16)], axis=-1)
 
 
-def build_package(folder: Path, given: PackageInput) -> list[Artifact]:
-    """Write the whole package into `folder`; every file of it, the manifest last.
+def build_package(folder: Path, given: PackageInput, judge: Judge | None = None) -> list[Artifact]:
+    """Write the whole package into `folder`; every file of it, the manifest last, which holds what `judge` found.
 
     Raises MachineLacks where the disk refuses, InternalError where the arrays contradict each other.
     """
@@ -157,8 +163,14 @@ def build_package(folder: Path, given: PackageInput) -> list[Artifact]:
         write_bytes(folder / "shaders" / name, text.encode("utf-8"))
         package.add(f"shaders/{name}")
 
+    if judge is not None:
+        package.judgement = judge(folder, _manifest(package))
+    for name in write_gates(folder, given.payload.job_name, package.judgement):
+        package.add(name)
+
     # The report shows the manifest as it stands without the report; the final manifest then names the report as well.
-    shown = report.ReportInput(_manifest(package), given.payload.fits, given.preview, irradiance, valid)
+    views = package.judgement.views
+    shown = report.ReportInput(_manifest(package), given.payload.fits, given.preview, irradiance, valid, views)
     write_bytes(folder / REPORT_HTML, report.render(shown))
     package.add(REPORT_HTML)
     manifest = _manifest(package).model_dump_json(indent=2) + "\n"
@@ -249,6 +261,7 @@ def _manifest(package: _Package) -> Manifest:
         metrics=ManifestMetrics(
             light_field=given.metrics.get(Function.LIGHT_FIELD), visibility=given.metrics.get(Function.VISIBILITY)
         ),
+        gates=package.judgement.results,
         left_out=_left_out(given),
         textures=package.textures,
         lightmap=_lightmap(given.texel_map),

@@ -19,6 +19,8 @@ MEDIA_TYPES: Final = {
     ".glb": "model/gltf-binary",
     ".json": "application/json",
     ".html": "text/html; charset=utf-8",
+    ".xml": "application/xml",
+    ".png": "image/png",
     ".glsl": "text/plain; charset=utf-8",
 }
 

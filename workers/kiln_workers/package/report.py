@@ -17,6 +17,7 @@ from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Artifact, FitMetrics, FitResult
 from kiln_workers.package import charts, colour
+from kiln_workers.package.gates import View
 from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelPreview
 from kiln_workers.sphere import octahedral
 
@@ -47,6 +48,8 @@ class ReportInput:
     preview: PackagePreview
     irradiance: Float32  # [H, W, 3], dilated
     covered: npt.NDArray[np.bool_]  # [H, W]
+    views: Sequence[View] = ()
+    """The pictures that quality gates compared."""
 
 
 def render(report: ReportInput) -> bytes:
@@ -65,6 +68,10 @@ def render(report: ReportInput) -> bytes:
         manifest=manifest,
         settings=_flat(manifest.settings.model_dump(mode="json")),
         functions=functions,
+        views=[
+            {"camera": v.camera, "picture": charts.data_uri(v.picture), "reference": charts.data_uri(v.reference)}
+            for v in report.views
+        ],
         stages=_stages(manifest.stage_seconds),
         atlas=charts.data_uri(report.preview.atlas),
         irradiance=charts.data_uri(_irradiance_picture(report.irradiance, report.covered)),

@@ -108,7 +108,11 @@ class ShadePackage:
     @classmethod
     def read(cls, folder: Path, device: torch.device) -> Self:
         """Read the package in `folder`; NotFound where there is none, InputError where it is damaged or too new."""
-        manifest = read_manifest(folder)
+        return cls.of(folder, read_manifest(folder), device)
+
+    @classmethod
+    def of(cls, folder: Path, manifest: Manifest, device: torch.device) -> Self:
+        """The same of a package whose manifest is not written yet."""
         scene = read_gltf(folder, SCENE_GLB)
         for mesh in scene.meshes:
             if mesh.lightmap_uv is None:

@@ -27,6 +27,7 @@ from kiln_workers.scene.picture import texel_map_picture
 from kiln_workers.scene.texel_map import TexelMap, unpack_texel_map
 from kiln_workers.sphere.gaussian import evaluate
 from kiln_workers.sphere.octahedral import pixel_directions
+from kiln_workers.stages.gates import GateJudge
 from kiln_workers.stages.tiles import map_coordinates, with_render_verdict
 from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
 from kiln_workers.store.light_field import LightFieldStore
@@ -54,20 +55,22 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
     store.write_texel_map({name: getattr(texel_map, name) for name in TEXEL_MAP_ARRAYS})
     tiles = tuple(sorted((render.tile for render in payload.renders), key=lambda tile: (tile.row, tile.column)))
 
+    steps = len(payload.fits) + 2
     lobes: dict[Function, LobeMap] = {}
     metrics: dict[Function, FitMetrics] = {}
     previews: dict[Function, FunctionPreview] = {}
     for number, fit in enumerate(payload.fits):
-        context.progress(number, len(payload.fits) + 2, "steps", f"evaluating the {fit.function.value}")
+        context.progress(number, steps, "steps", f"evaluating the {fit.function.value}")
         judged = _judge(fit, _Texels(store, texel_map, tiles, fit.function), context)
         lobes[fit.function], metrics[fit.function], previews[fit.function] = judged
 
-    context.progress(len(payload.fits), len(payload.fits) + 2, "steps", "convolving the environment")
+    context.progress(steps - 2, steps, "steps", "convolving the environment")
     environment = _convolve(scene.environment, payload.settings.package) if scene.environment else None
 
-    context.progress(len(payload.fits) + 1, len(payload.fits) + 2, "steps", "writing the package")
+    context.progress(steps - 1, steps, "steps", "writing the package")
     folder = context.scratch / "package"
     folder.mkdir()
+    judge = GateJudge(payload, scene, metrics, lambda message: context.progress(steps - 1, steps, "steps", message))
     artifacts = build_package(
         folder,
         PackageInput(
@@ -82,10 +85,11 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
             stage_seconds=_stage_seconds(payload, time.perf_counter() - began),
             versions=_versions(),
         ),
+        judge,
     )
     for artifact in artifacts:
         context.put_blob(folder / artifact.name)
-    return PackageResult(artifacts=tuple(artifacts), seconds=time.perf_counter() - began)
+    return PackageResult(artifacts=tuple(artifacts), gates=judge.results, seconds=time.perf_counter() - began)
 
 
 @dataclass(frozen=True)
