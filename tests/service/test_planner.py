@@ -5,6 +5,7 @@ import time
 import pytest
 
 from kiln_schemas.errors import InputError, TooLarge
+from kiln_schemas.gates import Gates
 from kiln_schemas.settings import PRESETS
 from kiln_schemas.tasks import PrepareResult, TaskKind, Tile
 from kiln_service.ids import new_id
@@ -23,7 +24,7 @@ def tile(row, column, texels=3):
 
 
 def plan(result, most=100):
-    return plan_after_prepare(result, PRESETS["draft"], most)
+    return plan_after_prepare(result, PRESETS["draft"], Gates(), most)
 
 
 def test_the_plan():

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Final, TypeVar
 from pydantic import ValidationError
 
 from kiln_schemas.base import Contract
+from kiln_schemas.camera import Camera
 from kiln_schemas.conventions import MANIFEST_JSON
 from kiln_schemas.errors import (
     Conflict,
@@ -29,15 +30,18 @@ from kiln_schemas.errors import (
     Problem,
     Unreachable,
 )
+from kiln_schemas.gates import GateResult, Gates, check_gates
 from kiln_schemas.job import JobRequest, JobView, TaskView
+from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import make_settings
-from kiln_schemas.states import JobState
+from kiln_schemas.states import PUBLISHED_JOB_STATES, JobState
 from kiln_service.cli.api import Api
 from kiln_service.cli.bundle import LocalBundle, collect
 from kiln_service.cli.farm import LocalFarm, share
 from kiln_service.cli.fetch import download_package, remove_package, writing
+from kiln_service.cli.gates import raise_unless_completed, write_junit, write_results
 from kiln_service.cli.output import notices
-from kiln_service.cli.progress import Display, follow, make_display, raise_unless_completed
+from kiln_service.cli.progress import Display, follow, make_display
 from kiln_service.cli.upload import upload_and_submit
 
 EXAMPLES: Final = ("gallery", "courtyard")
@@ -60,6 +64,9 @@ class BakeOptions:
     environment_rotation_deg: float
     preset: str
     overrides: tuple[str, ...]
+    gates: Gates
+    cameras: Mapping[str, Camera]
+    junit: Path | None
     workers: int | None
     resume: bool
     force: bool
@@ -89,10 +96,11 @@ class Summary(Contract):
     """From the first start to the last end of each stage's tasks."""
     stage_busy_seconds: dict[str, float]
     notes: tuple[str, ...]
+    gates: tuple[GateResult, ...] = ()
 
 
 def bake(options: BakeOptions) -> Summary:
-    """Bake; the summary of what is in `options.out`."""
+    """Bake; the summary of what is in `options.out`, whether it meets its gates or not."""
     began = time.monotonic()
     if options.out.exists() and not options.out.is_dir():
         raise InputError("is not a folder", where=str(options.out), remedy="Choose another --out.")
@@ -105,7 +113,10 @@ def bake(options: BakeOptions) -> Summary:
         )
     if not options.resume:
         if not options.force and _is_done(options.out, record):
-            return _summary(options.out, None, (), began)
+            done = _summary(options.out, None, (), began)
+            if options.junit is not None:
+                write_results(options.junit, record.request.name, done.gates)
+            return done
         _make_room(options, data)
         _write(data / RECORD, record)
     try:
@@ -116,7 +127,9 @@ def bake(options: BakeOptions) -> Summary:
         raise
     if job.error is not None and not options.keep and isinstance(KilnError.from_problem(job.error), InputError):
         _leave_nothing(options.out, data)
-    raise_unless_completed(job)
+    write_junit(options.junit, job)
+    if job.state not in PUBLISHED_JOB_STATES:
+        raise_unless_completed(job)
     _write(options.out / RECORD, record)
     if not options.keep:
         shutil.rmtree(data, ignore_errors=True)
@@ -126,7 +139,7 @@ def bake(options: BakeOptions) -> Summary:
 def _run(
     options: BakeOptions, data: Path, request: JobRequest, local: LocalBundle, display: Display
 ) -> tuple[JobView, tuple[TaskView, ...]]:
-    """Start everything, bring the job to its end, download where it completed, stop everything."""
+    """Start everything, bring the job to its end, download where there is a package, stop everything."""
     count, threads, memory = share(options.workers)
     with LocalFarm(data, workers=count, threads=threads, memory=memory, say=display.say) as farm:
         farm.start()
@@ -135,7 +148,7 @@ def _run(
             if job_id is None:
                 job_id = _steadily(farm, lambda: upload_and_submit(api, local, request, bar=False)).id
             job = follow(api, job_id, display, between=farm.revive)
-            if job.state is not JobState.COMPLETED:
+            if job.state not in PUBLISHED_JOB_STATES:
                 return job, ()
             tasks = _steadily(farm, lambda: api.tasks(job.id))
             _steadily(farm, lambda: download_package(api, job.id, options.out, force=True, bar=False))
@@ -181,6 +194,7 @@ def _planned(options: BakeOptions) -> Record:
     if options.scene is None:
         raise InputError("no scene is given", where="SCENE", remedy="Name a file, `gallery` or `courtyard`.")
     make_settings(options.preset, options.overrides)
+    check_gates(options.gates, options.cameras)
     scene, environment = Path(options.scene), options.environment
     if options.scene in EXAMPLES and not scene.exists():
         folder = options.out / "scene"
@@ -194,7 +208,14 @@ def _planned(options: BakeOptions) -> Record:
         scale=options.environment_scale,
         rotation_deg=options.environment_rotation_deg,
     )
-    request = JobRequest(name=scene.stem[:128], bundle=local.bundle, preset=options.preset, set=options.overrides)
+    request = JobRequest(
+        name=scene.stem[:128],
+        bundle=local.bundle,
+        preset=options.preset,
+        set=options.overrides,
+        gates=options.gates,
+        cameras=dict(options.cameras),
+    )
     return Record(
         scene=str(scene.absolute()),
         environment=None if environment is None else str(environment.absolute()),
@@ -291,7 +312,13 @@ def _summary(out: Path, job: JobView | None, tasks: tuple[TaskView, ...], began:
         stage_wall_seconds=wall,
         stage_busy_seconds={stage.kind.value: stage.seconds for stage in job.stages} if job else {},
         notes=job.notes if job else (),
+        gates=job.gate_results if job else _gates_of(out / MANIFEST_JSON),
     )
+
+
+def _gates_of(manifest: Path) -> tuple[GateResult, ...]:
+    """The gates of a package that was baked before."""
+    return Manifest.model_validate_json(manifest.read_bytes()).gates
 
 
 def _read(path: Path) -> Record | None:

@@ -2,7 +2,8 @@
 
 Exit codes: 0 done; 1 a defect of lightkiln; 2 wrong usage; 3 an input (scene, file, setting, id) is wrong; 4 the bake
 failed or the request contradicts the present state; 5 canceled; 6 the coordinator does not answer or refuses the token;
-7 this machine lacks something; 130 interrupted (docs/cli.md, kiln_schemas.errors).
+7 this machine lacks something; 8 the package is there, but misses a quality gate; 130 interrupted
+(docs/cli.md, kiln_schemas.errors).
 """
 
 import os
@@ -17,19 +18,22 @@ from rich.markup import escape
 from rich.table import Table
 
 from kiln_schemas import __version__
-from kiln_schemas.errors import DISK_FULL, Canceled, KilnError, MachineLacks
+from kiln_schemas.errors import DISK_FULL, KilnError, MachineLacks
+from kiln_schemas.gates import check_gates, read_cameras, read_gates
 from kiln_schemas.job import JobRequest
 from kiln_schemas.settings import make_settings
-from kiln_schemas.states import FINAL_JOB_STATES, JobState
+from kiln_schemas.states import FINAL_JOB_STATES, PUBLISHED_JOB_STATES, JobState
 from kiln_service.cli import bake as baking
 from kiln_service.cli import options
 from kiln_service.cli.become import become
 from kiln_service.cli.bundle import collect
 from kiln_service.cli.doctor import examine
 from kiln_service.cli.fetch import download_package
+from kiln_service.cli.gates import end_of, raise_if_missed, raise_unless_completed, write_junit
 from kiln_service.cli.output import (
     defect,
     duration,
+    notices,
     print_error,
     print_json,
     results,
@@ -37,7 +41,7 @@ from kiln_service.cli.output import (
     stage_table,
 )
 from kiln_service.cli.pictures import add_picture_commands
-from kiln_service.cli.progress import follow, make_display, raise_unless_completed
+from kiln_service.cli.progress import follow, make_display
 from kiln_service.cli.upload import upload_and_submit
 
 INTERRUPTED: Final = 130
@@ -72,6 +76,9 @@ def bake(
     env_rotation: options.EnvironmentRotation = 0.0,
     preset: options.Preset = "preview",
     overrides: options.Overrides = None,
+    gate: options.Gate = None,
+    camera: options.Cameras = None,
+    junit: options.Junit = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, max=256, help="Local workers.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the interrupted bake in DIR.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace what is in DIR.")] = False,
@@ -88,6 +95,9 @@ def bake(
             environment_rotation_deg=env_rotation,
             preset=preset,
             overrides=tuple(overrides or ()),
+            gates=read_gates(gate or ()),
+            cameras=read_cameras(camera or ()),
+            junit=junit,
             workers=workers,
             resume=resume,
             force=force,
@@ -95,6 +105,7 @@ def bake(
         )
     )
     if json:
+        raise_if_missed(summary.gates)
         print_json(summary)
         return
     if summary.already_done:
@@ -111,6 +122,9 @@ def bake(
             results.print(f"{word:9} {shown_path(Path(path).absolute())}", markup=False, soft_wrap=True)
     if summary.report is not None:
         results.print("The pictures are in the report: open it in a browser.")
+    for result in summary.gates:
+        results.print(f"gate      {result.sentence()}", markup=False, soft_wrap=True)
+    raise_if_missed(summary.gates)
 
 
 @app.command()
@@ -168,6 +182,8 @@ def submit(
     env_rotation: options.EnvironmentRotation = 0.0,
     preset: options.Preset = "preview",
     overrides: options.Overrides = None,
+    gate: options.Gate = None,
+    camera: options.Cameras = None,
     name: Annotated[str | None, typer.Option("--name", help="The job's name; the file's by default.")] = None,
     url: options.Url = options.DEFAULT_URL,
     token: options.Token = None,
@@ -176,8 +192,17 @@ def submit(
 ) -> None:
     """Upload a scene and submit a job to a coordinator."""
     make_settings(preset, overrides or ())
+    cameras = read_cameras(camera or ())
+    gates = check_gates(read_gates(gate or ()), cameras)
     local = collect(scene, env, scale=env_scale, rotation_deg=env_rotation)
-    request = JobRequest(name=name or scene.stem[:128], bundle=local.bundle, preset=preset, set=tuple(overrides or ()))
+    request = JobRequest(
+        name=name or scene.stem[:128],
+        bundle=local.bundle,
+        preset=preset,
+        set=tuple(overrides or ()),
+        gates=gates,
+        cameras=cameras,
+    )
     with options.connect(url, token, data) as api:
         job = upload_and_submit(api, local, request)
     if json:
@@ -213,6 +238,8 @@ def status(
     left = f", about {duration(view.remaining_s)} left" if view.remaining_s is not None else ""
     results.print(f"{view.name}: {view.state.value}{left}", markup=False)
     results.print(stage_table(view))
+    for result in view.gate_results:
+        results.print(f"gate: {result.sentence()}", markup=False, soft_wrap=True)
     if view.error is not None:
         results.print(view.error.sentence(), markup=False, soft_wrap=True)
 
@@ -220,6 +247,7 @@ def status(
 @app.command()
 def watch(
     job: options.JobId,
+    junit: options.Junit = None,
     url: options.Url = options.DEFAULT_URL,
     token: options.Token = None,
     data: options.Data = None,
@@ -229,10 +257,11 @@ def watch(
     # A coordinator that is restarted meanwhile does not end the watching.
     with options.connect(url, token, data, patience_s=60) as api, make_display(quiet=json) as display:
         view = follow(api, job, display, on_change=print_json if json else None)
-    if json and view.state is not JobState.COMPLETED:
+    write_junit(junit, view)
+    ended = end_of(view)
+    if json and ended is not None:
         # The last line already tells the error; only the code is missing.
-        ended = KilnError.from_problem(view.error) if view.error else Canceled("the job was canceled")
-        raise typer.Exit(ended.exit_code)
+        raise typer.Exit(KilnError.from_problem(ended).exit_code)
     raise_unless_completed(view)
 
 
@@ -258,17 +287,21 @@ def download(
     job: options.JobId,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the package.")],
     force: Annotated[bool, typer.Option("--force", help="Replace the package in DIR.")] = False,
+    junit: options.Junit = None,
     url: options.Url = options.DEFAULT_URL,
     token: options.Token = None,
     data: options.Data = None,
     json: options.Json = False,
 ) -> None:
-    """Download a completed job's package."""
+    """Download a job's package, whether it meets its quality gates or not."""
     with options.connect(url, token, data) as api:
         view = api.job(job)
-        if view.state in FINAL_JOB_STATES:
+        write_junit(junit, view)
+        if view.state in FINAL_JOB_STATES - PUBLISHED_JOB_STATES:
             raise_unless_completed(view)
         files = download_package(api, job, out, force=force)
+    if view.state is JobState.GATE_FAILED and view.error is not None:
+        notices.print(view.error.sentence(), markup=False, soft_wrap=True)
     if json:
         print_json({"out": str(out), "files": [str(path.relative_to(out)) for path in files]})
     else:

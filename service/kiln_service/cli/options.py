@@ -30,6 +30,25 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, e.g. render.samples=64; may be repeated."),
 ]
+Gate = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--gate",
+        metavar="NAME=VALUE",
+        help="Largest log_mse_rel, visibility_log_mse_rel or flip.CAMERA; may be repeated. Exit code 8 where missed.",
+    ),
+]
+Cameras = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--camera",
+        metavar="NAME=CAMERA",
+        help="A camera for flip gates: NAME=px,py,pz:tx,ty,tz:fov or NAME=FILE.json; may be repeated.",
+    ),
+]
+Junit = Annotated[
+    Path | None, typer.Option("--junit", metavar="FILE", help="Write the gates' results as JUnit XML when it is over.")
+]
 Environment = Annotated[
     Path | None, typer.Option("--env", metavar="FILE", help="Distant light: an equirectangular HDR or EXR.")
 ]

@@ -13,9 +13,9 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from kiln_schemas.errors import Canceled, KilnError, Problem, Unreachable
+from kiln_schemas.errors import Unreachable
 from kiln_schemas.job import JobView, StageView, TaskView
-from kiln_schemas.states import FINAL_JOB_STATES, JobState
+from kiln_schemas.states import FINAL_JOB_STATES
 from kiln_schemas.tasks import TaskKind
 from kiln_service.cli.api import Api
 from kiln_service.cli.output import duration, notices
@@ -143,13 +143,3 @@ def follow(
         if between is not None:
             between()
         time.sleep(POLL_S)
-
-
-def raise_unless_completed(job: JobView) -> JobView:
-    """The job, if it completed; else the error that it ended with."""
-    if job.state is JobState.CANCELED:
-        raise Canceled(f"the job {job.id} was canceled")
-    if job.state is JobState.FAILED:
-        lost = Problem(title="The bake failed", status=500, code="bake-failed", detail=f"the job {job.id} failed")
-        raise KilnError.from_problem(job.error or lost)
-    return job
