@@ -172,7 +172,7 @@ class Farm:
 
     def finish(self, job: str) -> None:
         """Wait until the job has completed."""
-        over = ("completed", "failed", "canceled")
+        over = ("completed", "gate-failed", "failed", "canceled")
         state = wait_until("the job ends", lambda: (now := self.state(job)) in over and now, 300)
         assert state == "completed", self.get(f"/v1/jobs/{job}")
 

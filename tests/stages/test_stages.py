@@ -1,15 +1,22 @@
 """The four stages in one process, on a room: what the package's textures hold is what the networks gave."""
 
 import hashlib
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
+import torch
 from e2e_farm import TINY, room, sky
 
+from kiln_schemas.camera import Camera
 from kiln_schemas.errors import Canceled, InputError
+from kiln_schemas.gates import Gates
+from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import Function, make_settings
 from kiln_schemas.tasks import (
     Bundle,
@@ -25,13 +32,24 @@ from kiln_schemas.tasks import (
 )
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.package import ktx2
+from kiln_workers.package.exr import write_rgb
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.package.half import layers_to_lobes
+from kiln_workers.scene.archive import unpack_scene
 from kiln_workers.scene.examples import write_exr
 from kiln_workers.scene.texel_map import TexelState, unpack_texel_map
-from kiln_workers.stages import fit, package, prepare, render
+from kiln_workers.shade.gbuffer import render_gbuffer
+from kiln_workers.shade.image_metrics import flip
+from kiln_workers.shade.package import ShadePackage, read_manifest
+from kiln_workers.shade.picture import shade
+from kiln_workers.shade.reference import path_trace
+from kiln_workers.stages import fit, gates, package, prepare, render
 from kiln_workers.stages.tiles import covered_texels, map_coordinates, plan_tiles, with_render_verdict
 from kiln_workers.store.light_field import LightFieldStore
+
+FRONT = Camera(position=(0.3, 1.1, 3.6), target=(0.0, 0.9, -0.5), fov_deg=45)
+GATES = Gates(log_mse_rel=1e-6, visibility_log_mse_rel=0.5, flip={"front": 0.6})
+"""One that is missed and two that are met; the loose one makes do with few paths."""
 
 
 @dataclass
@@ -126,7 +144,15 @@ def baked(tmp_path_factory: pytest.TempPathFactory) -> Baked:
     )
     packaged = package.run(
         PackagePayload(
-            job_id="j", job_name="room", bundle=bundle, prepare=prepared, renders=renders, fits=fits, **common
+            job_id="j",
+            job_name="room",
+            bundle=bundle,
+            prepare=prepared,
+            renders=renders,
+            fits=fits,
+            gates=GATES,
+            cameras={"front": FRONT},
+            **common,
         ),
         context,
     )
@@ -188,3 +214,79 @@ def test_a_dark_scene_is_refused(baked: Baked) -> None:
     bundle = Bundle(entry="dark.glb", files={"dark.glb": context.put_blob(encode_glb(room(lamp=0.0)))})
     with pytest.raises(InputError, match="light"):
         prepare.run(baked.prepare_payload.model_copy(update={"bundle": bundle}), context)
+
+
+@pytest.fixture(scope="module")
+def downloaded(baked: Baked, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package as a client has it."""
+    folder = tmp_path_factory.mktemp("downloaded")
+    for artifact in baked.packaged.artifacts:
+        (folder / artifact.name).parent.mkdir(exist_ok=True)
+        (folder / artifact.name).write_bytes(baked.context.blobs[artifact.sha256])
+    return folder
+
+
+def test_gates_are_in_the_result_the_manifest_and_the_files(baked: Baked, downloaded: Path) -> None:
+    manifest = Manifest.model_validate_json((downloaded / "manifest.json").read_bytes())
+    light, visibility, front = baked.packaged.gates
+    assert manifest.gates == baked.packaged.gates
+    assert manifest.metrics.light_field is not None and manifest.metrics.visibility is not None
+    assert (light.name, light.value) == ("log_mse_rel", manifest.metrics.light_field.log_mse_rel)
+    assert visibility.value == manifest.metrics.visibility.log_mse_rel
+    assert [gate.passed for gate in manifest.gates] == [False, True, True]
+    assert front.flip_of_halves is not None and 0.0 < front.flip_of_halves < 0.3
+
+    suite = ElementTree.parse(downloaded / "gates.xml").getroot()
+    assert (suite.get("name"), suite.get("tests"), suite.get("failures")) == ("room", "3", "1")
+    assert [case.get("name") for case in suite] == ["log_mse_rel", "visibility_log_mse_rel", "flip.front"]
+    assert [case.find("failure") is not None for case in suite] == [True, False, False]
+    types = {a.name: a.media_type for a in manifest.files}
+    assert types["gates.xml"] == "application/xml"
+    assert types["gates/front.png"] == types["gates/front_reference.png"] == "image/png"
+    report = (downloaded / "report.html").read_text()
+    assert "Quality gates: 1 of 3 missed" in report and "front: the reference, path-traced" in report
+
+
+def test_flip_is_that_of_the_package_as_downloaded(baked: Baked, downloaded: Path) -> None:
+    package = ShadePackage.read(downloaded, torch.device("cpu"))
+    picture = shade(package, render_gbuffer(package.scene, FRONT, 480, 270))
+    scene = unpack_scene(baked.context.blob(baked.prepared.scene))
+    reference = path_trace(scene, FRONT, 480, 270, samples=64, max_depth=12, seed=1)
+    stated = baked.packaged.gates[2]
+    assert stated.value == pytest.approx(flip(reference.picture, picture), rel=1e-3)
+    assert stated.flip_of_halves == pytest.approx(flip(*reference.halves), rel=1e-3)
+    # The pictures have one white point, so they look alike where the package is right.
+    shown = [
+        oiio.ImageBuf(str(downloaded / f"gates/front{end}.png")).get_pixels(oiio.FLOAT) for end in ("", "_reference")
+    ]
+    assert shown[0].shape == (270, 480, 3) and shown[0].mean() == pytest.approx(shown[1].mean(), rel=0.2)
+
+
+def test_a_package_without_its_irradiance_misses_the_gate(
+    baked: Baked, downloaded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gates, "WIDTH", 96)
+    monkeypatch.setattr(gates, "HEIGHT", 54)
+    shutil.copytree(downloaded, tmp_path / "dark")
+    write_rgb(tmp_path / "dark" / "irradiance.exr", np.zeros((16, 16, 3), np.float32))
+    payload = PackagePayload(
+        job_id="j",
+        job_name="room",
+        bundle=baked.prepare_payload.bundle,
+        prepare=baked.prepared,
+        renders=(),
+        fits=(),
+        settings=baked.prepare_payload.settings,
+        store_url="",
+        gates=Gates(flip={"front": 0.3}),
+        cameras={"front": FRONT},
+    )
+    told: list[str] = []
+    judge = gates.GateJudge(payload, unpack_scene(baked.context.blob(baked.prepared.scene)), {}, told.append)
+    values = {}
+    for folder in (downloaded, tmp_path / "dark"):
+        (result,) = judge(folder, read_manifest(folder)).results
+        values[folder.name] = result.value
+        assert result.flip_of_halves is not None and result.flip_of_halves <= 0.15, "half of the threshold"
+    assert values["dark"] > 0.3 > values[downloaded.name]
+    assert told[0] == "shading from camera front" and told[1] == "path-tracing from camera front"
