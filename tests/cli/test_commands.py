@@ -5,6 +5,7 @@ import signal
 import subprocess
 import time
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -27,6 +28,19 @@ DEAD = "http://127.0.0.1:9"
         (["bake", "nowhere.glb", "--out", "out", "--set", "lightmap.resolution=0"], 3, "lightmap.resolution"),
         (["bake", "nowhere.glb", "--out", "out", "--set", "lightmap.resolution=100000"], 3, "lightmap.resolution"),
         (["bake", "nowhere.glb", "--out", "out", "--workers", "0"], 2, "--workers"),
+        (
+            ["bake", "nowhere.glb", "--out", "out", "--gate", "log_mse=1"],
+            3,
+            "--gate log_mse=1: 'log_mse' is not a gate",
+        ),
+        (["bake", "nowhere.glb", "--out", "out", "--gate", "log_mse_rel=2"], 3, "less than or equal to 1"),
+        (["bake", "nowhere.glb", "--out", "out", "--gate", "log_mse_rel"], 3, "'' is not a number"),
+        (["bake", "nowhere.glb", "--out", "out", "--gate", "flip.a=0.1"], 3, "gates.flip.a: there is no camera 'a'"),
+        (["bake", "nowhere.glb", "--out", "out", "--gate", "flip=0.1"], 3, "'flip' is not a gate"),
+        (["bake", "nowhere.glb", "--out", "out", "--camera", "0,0,0:1,1,1:40"], 3, "has no name"),
+        (["bake", "nowhere.glb", "--out", "out", "--camera", "a=0,0,0:0,0,0:40"], 3, "coincide"),
+        (["bake", "nowhere.glb", "--out", "out", "--camera", "a=none.json"], 3, "--camera a=none.json: cannot be read"),
+        (["bake", "nowhere.glb", "--out", "out", "--camera", "a/b=0,0,0:1,1,1:40"], 3, "A name has letters"),
         (["bake", "--resume", "--out", "out"], 3, "there is no interrupted bake"),
         (["status"], 6, "no token is given"),
         (["status", "--token", "t", "--url", DEAD], 6, "does not answer"),
@@ -91,6 +105,30 @@ def test_submit_status_watch_cancel(lightkiln, coordinator, lit_glb: Path) -> No
     watched = lightkiln("watch", job["id"], *at, "--json")
     assert watched.code == 5 and '"state": "canceled"' in watched.out.splitlines()[-1]
     assert lightkiln("watch", job["id"], *at).code == 5
+
+
+def test_gates_are_submitted_and_a_job_without_results_has_a_junit_file(
+    lightkiln, coordinator, lit_glb: Path, tmp_path: Path
+) -> None:
+    at = ("--url", coordinator.url, "--data", coordinator.data)
+    (tmp_path / "side.json").write_text('{"position": [3, 0, 0], "target": [0, 0, 0], "fov_deg": 30}')
+    cameras = ("--camera", "front=0,0,3:0,0,0:42", "--camera", f"side={tmp_path / 'side.json'}")
+    gates = ("--gate", "log_mse_rel=0.2", "--gate", "flip.front=0.5", "--gate", "flip.front=0.08")
+    job = lightkiln("submit", lit_glb, "--name", "lamp", *cameras, *gates, *at, "--json").document
+    assert job["gates"] == {"log_mse_rel": 0.2, "visibility_log_mse_rel": None, "flip": {"front": 0.08}}
+    assert job["cameras"]["front"]["fov_deg"] == 42 and job["cameras"]["side"]["position"] == [3, 0, 0]
+
+    lightkiln("cancel", job["id"], *at)
+    file = tmp_path / "reports" / "junit.xml"
+    assert lightkiln("watch", job["id"], "--junit", file, *at).code == 5
+    suite = ElementTree.parse(file).getroot()
+    assert dict(suite.items()) == {"name": "lamp", "tests": "3", "failures": "0", "errors": "1", "skipped": "2"}
+    assert [(case.get("name"), case[0].tag) for case in suite] == [
+        ("log_mse_rel", "skipped"),
+        ("flip.front", "skipped"),
+        ("bake", "error"),
+    ]
+    assert "was canceled" in suite[2][0].get("message", "")
 
 
 def test_the_environment_of_the_shell_names_the_coordinator(lightkiln, coordinator) -> None:
