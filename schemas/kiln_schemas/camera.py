@@ -12,7 +12,8 @@ from pydantic import Field, ValidationError, model_validator
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import InputError
 
-Triple = tuple[float, float, float]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Triple = tuple[Coordinate, Coordinate, Coordinate]
 CameraName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
 """Also part of a file's name, so of the same characters as an artifact's."""
 
