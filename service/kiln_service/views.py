@@ -64,7 +64,7 @@ async def task_log(database: Database, task_id: str) -> str:
 
 
 async def artifacts(database: Database, job_id: str) -> tuple[Artifact, ...]:
-    """What a job published; nothing before it has completed."""
+    """What a job published; nothing before its package is there."""
     async with database.transaction() as tx:
         await _require_job(tx, job_id)
         rows = await tx.all("list_artifacts", job_id=job_id)

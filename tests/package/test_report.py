@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kiln_schemas.gates import GateResult
+from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import CurvePoint
 from kiln_workers.package import charts, report
 from kiln_workers.package.build import build_package
+from kiln_workers.package.gates import Judgement, View
 from kiln_workers.package.preview import choose_texels
 
 
@@ -88,6 +91,38 @@ def test_without_environment_it_says_why_there_is_no_visibility(make_sample, tmp
     words = "".join(page.text)
     assert "visibility: the scene has no environment" in " ".join(words.split())
     assert "Environment visibility" not in words
+
+
+def test_gates_and_what_they_compared_are_shown(make_sample, tmp_path: Path, read_png) -> None:
+    random = np.random.default_rng(5)
+    picture, reference = (random.integers(0, 256, (9, 16, 3), dtype=np.uint8) for _ in range(2))
+    results = (GateResult.of("log_mse_rel", 0.1, 0.2), GateResult.of("flip.front", 0.123, 0.08, 0.0456))
+    judged = []
+
+    def judge(folder: Path, manifest: Manifest) -> Judgement:
+        judged.append((sorted(path.name for path in folder.iterdir()), manifest))
+        return Judgement(results, (View("front", picture, reference),))
+
+    artifacts = build_package(tmp_path, make_sample().given, judge)
+    ((files, manifest),) = judged
+    assert "lightfield.ktx2" in files and "scene.glb" in files and "manifest.json" not in files
+    assert manifest.gates == () and "lightfield.ktx2" in manifest.textures
+    assert Manifest.model_validate_json((tmp_path / "manifest.json").read_bytes()).gates == results
+    assert {"gates.xml", "gates/front.png", "gates/front_reference.png"} <= {item.name for item in artifacts}
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    words = " ".join(" ".join(page.text).split())
+    assert "Quality gates: 1 of 2 missed" in words
+    assert "log_mse_rel met 0.100 0.200" in words and "flip.front missed 0.123 0.0800 0.0456" in words
+    by_label = {attributes["alt"]: attributes["src"] for tag, attributes in page.elements if tag == "img"}
+    for label, name, pixels in (("package", "front", picture), ("reference", "front_reference", reference)):
+        shown = base64.b64decode(by_label[f"front: the {label}"].partition(",")[2])
+        np.testing.assert_array_equal(read_png(shown), pixels)
+        np.testing.assert_array_equal(read_png((tmp_path / "gates" / f"{name}.png").read_bytes()), pixels)
+
+
+def test_without_gates_the_report_has_none(make_sample, tmp_path: Path) -> None:
+    text, _ = built(tmp_path, make_sample())
+    assert "Quality gates" not in text
 
 
 def test_pictures_show_only_what_lies_above_the_horizon(make_sample) -> None:

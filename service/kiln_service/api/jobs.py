@@ -44,7 +44,7 @@ async def list_jobs(
 
 @router.get("/jobs/{job_id}", dependencies=[Reader], responses=problems(404))
 async def job(job_id: str, parts: PartsHere) -> JobView:
-    """One job with its stages, the time left and, if it failed, why."""
+    """One job with its stages, the time left, its quality gates and, if it failed, why."""
     return await views.job_view(parts.database, job_id)
 
 
@@ -107,7 +107,7 @@ async def events(
 
 @router.get("/jobs/{job_id}/artifacts", dependencies=[Reader], responses=problems(404))
 async def artifacts(job_id: str, parts: PartsHere) -> tuple[Artifact, ...]:
-    """What the job published: empty until it has completed."""
+    """What the job published: empty until it has completed, whether its quality gates are met or not."""
     return await views.artifacts(parts.database, job_id)
 
 

@@ -97,7 +97,7 @@ class Api:
         return JobView.model_validate_json(self._call("POST", f"/v1/jobs/{quote(job_id, safe='')}/cancel").content)
 
     def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
-        """What a completed job published."""
+        """What a job published."""
         reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/artifacts")
         return TypeAdapter(tuple[Artifact, ...]).validate_json(reply.content)
 
