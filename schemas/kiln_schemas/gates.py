@@ -54,7 +54,9 @@ class GateResult(Contract):
     threshold: Threshold
     passed: bool
     flip_of_halves: float | None = Field(default=None, ge=0.0)
-    """Of a FLIP gate: FLIP of the reference's two halves. Its picture, their mean, has about half of that as noise."""
+    """Of a FLIP gate: FLIP of the reference's two halves."""
+    noise_floor: float | None = Field(default=None, ge=0.0)
+    """Of a FLIP gate: what a package without any error would measure, for the noise of the reference."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -63,15 +65,14 @@ class GateResult(Contract):
         return self
 
     @classmethod
-    def of(cls, name: str, value: float, threshold: float, flip_of_halves: float | None = None) -> Self:
-        """The verdict on a measured value."""
-        passed = value <= threshold
-        return cls(name=name, value=value, threshold=threshold, passed=passed, flip_of_halves=flip_of_halves)
+    def of(cls, name: str, value: float, threshold: float, **noise: float) -> Self:
+        """The verdict on a measured value; `noise` are the two figures of a FLIP gate's reference."""
+        return cls(name=name, value=value, threshold=threshold, passed=value <= threshold, **noise)
 
     def sentence(self) -> str:
         """What was measured and what was allowed."""
         relation = "within" if self.passed else "more than"
-        noise = "" if self.flip_of_halves is None else f" (the reference's halves differ by {self.flip_of_halves:.4g})"
+        noise = "" if self.noise_floor is None else f" (noise of the reference: {self.noise_floor:.4g})"
         return f"{self.name} is {self.value:.6g}, {relation} the threshold {self.threshold:.6g}{noise}"
 
 

@@ -65,11 +65,11 @@ def test_cameras_that_are_refused(word: str, why: str) -> None:
 
 
 def test_a_missed_gate_is_an_error_of_its_own() -> None:
-    met, missed = GateResult.of("log_mse_rel", 0.2, 0.2), GateResult.of("flip.front", 0.2, 0.1, 0.03)
+    met, missed = GateResult.of("log_mse_rel", 0.2, 0.2), GateResult.of("flip.front", 0.2, 0.1, noise_floor=0.03)
     assert gate_problem([met]) is None
     problem = gate_problem([met, missed])
     assert problem is not None and problem.code == "gate-failed"
-    assert problem.detail == "flip.front is 0.2, more than the threshold 0.1 (the reference's halves differ by 0.03)"
+    assert problem.detail == "flip.front is 0.2, more than the threshold 0.1 (noise of the reference: 0.03)"
     error = KilnError.from_problem(problem)
     assert isinstance(error, GateFailed) and error.exit_code == 8
 

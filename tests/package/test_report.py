@@ -96,7 +96,7 @@ def test_without_environment_it_says_why_there_is_no_visibility(make_sample, tmp
 def test_gates_and_what_they_compared_are_shown(make_sample, tmp_path: Path, read_png) -> None:
     random = np.random.default_rng(5)
     picture, reference = (random.integers(0, 256, (9, 16, 3), dtype=np.uint8) for _ in range(2))
-    results = (GateResult.of("log_mse_rel", 0.1, 0.2), GateResult.of("flip.front", 0.123, 0.08, 0.0456))
+    results = (GateResult.of("log_mse_rel", 0.1, 0.2), GateResult.of("flip.front", 0.123, 0.08, noise_floor=0.0456))
     judged = []
 
     def judge(folder: Path, manifest: Manifest) -> Judgement:

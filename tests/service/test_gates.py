@@ -22,7 +22,8 @@ def measured(log_mse_rel: float, flip: float) -> list[dict[str, object]]:
             "value": flip,
             "threshold": 0.08,
             "passed": flip <= 0.08,
-            "flip_of_halves": 0.01,
+            "flip_of_halves": 0.015,
+            "noise_floor": 0.01,
         },
     ]
 

@@ -234,7 +234,8 @@ def test_gates_are_in_the_result_the_manifest_and_the_files(baked: Baked, downlo
     assert (light.name, light.value) == ("log_mse_rel", manifest.metrics.light_field.log_mse_rel)
     assert visibility.value == manifest.metrics.visibility.log_mse_rel
     assert [gate.passed for gate in manifest.gates] == [False, True, True]
-    assert front.flip_of_halves is not None and 0.0 < front.flip_of_halves < 0.3
+    assert front.flip_of_halves is not None and front.noise_floor is not None
+    assert 0.0 < front.noise_floor < front.flip_of_halves < 0.3
 
     suite = ElementTree.parse(downloaded / "gates.xml").getroot()
     assert (suite.get("name"), suite.get("tests"), suite.get("failures")) == ("room", "3", "1")

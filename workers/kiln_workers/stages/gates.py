@@ -27,10 +27,10 @@ from kiln_workers.package.gates import Judgement, View
 from kiln_workers.render.backend import select_variant
 from kiln_workers.scene.model import Float32, Scene
 from kiln_workers.shade.gbuffer import render_gbuffer
-from kiln_workers.shade.image_metrics import flip
+from kiln_workers.shade.image_metrics import flip, flip_noise_floor
 from kiln_workers.shade.package import ShadePackage
 from kiln_workers.shade.picture import shade
-from kiln_workers.shade.reference import path_trace
+from kiln_workers.shade.reference import Reference, path_trace
 
 WIDTH: Final = 480
 HEIGHT: Final = 270
@@ -86,10 +86,13 @@ class GateJudge:
         picture = shaded(folder, manifest, camera)
         depth = max(LEAST_DEPTH, self.payload.settings.render.max_depth + 1)
         tell = partial(self.on_progress, f"path-tracing from camera {name}")
-        reference, halves = traced(self.scene, camera, depth, NOISE_SHARE * threshold, tell)
+        made, flip_of_halves = traced(self.scene, camera, depth, NOISE_SHARE * threshold, tell)
+        reference, noise = made.picture, float(flip_noise_floor(made.halves).mean())
+        value = flip(reference, picture)
+        result = GateResult.of(FLIP + name, value, threshold, flip_of_halves=flip_of_halves, noise_floor=noise)
         white = colour.white_point(reference)
         view = View(name, colour.tone_map(picture, white), colour.tone_map(reference, white))
-        return GateResult.of(FLIP + name, flip(reference, picture), threshold, halves), view
+        return result, view
 
 
 def shaded(folder: Path, manifest: Manifest, camera: Camera) -> Float32:
@@ -101,20 +104,17 @@ def shaded(folder: Path, manifest: Manifest, camera: Camera) -> Float32:
 
 def traced(
     scene: Scene, camera: Camera, max_depth: int, most_noise: float, on_round: Callable[[], None]
-) -> tuple[Float32, float]:
-    """The reference [HEIGHT, WIDTH, 3], and the FLIP of its halves, which is `most_noise` where the bound allows.
-
-    The picture's own noise is less than that of its halves against each other; measured: two thirds.
-    """
+) -> tuple[Reference, float]:
+    """The reference [HEIGHT, WIDTH, 3], and the FLIP of its halves, which is at most `most_noise` within the bound."""
     totals = np.zeros((2, HEIGHT, WIDTH, 3))
     for done in range(1, MOST_ROUNDS + 1):
         on_round()
         made = path_trace(scene, camera, WIDTH, HEIGHT, SAMPLES_A_ROUND, max_depth, seed=done)
         totals += np.stack(made.halves)
-        # The noise falls with the root of the rounds: looking after each power of two is often enough.
+        # The noise falls slowly with the rounds: looking after each power of two is often enough.
         if done & (done - 1) == 0 or done == MOST_ROUNDS:
             one, other = (totals / done).astype(np.float32)
             noise = flip(one, other)
             if noise <= most_noise:
                 break
-    return 0.5 * (one + other), noise
+    return Reference((one, other), done * SAMPLES_A_ROUND), noise
