@@ -34,8 +34,3 @@ def basis(directions: Floats, bands: int) -> Floats:
         cosine, sine = x * cosine - y * sine, x * sine + y * cosine
         diagonal *= 2 * m + 1
     return out
-
-
-def band_of(bands: int) -> npt.NDArray[np.int64]:
-    """The l of every coefficient [bands^2]."""
-    return np.repeat(np.arange(bands), 2 * np.arange(bands) + 1).astype(np.int64)

@@ -17,7 +17,7 @@ from torch import Tensor
 from kiln_workers.fit.field import TexelField
 from kiln_workers.fit.lobes import LOG_AMPLITUDE, fibonacci_axes
 from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, nobody
-from kiln_workers.fit.solvers.adam import AdamOptions, adam
+from kiln_workers.fit.solvers.descent import AdamOptions, adam
 from kiln_workers.fit.solvers.nnls import solve_nnls
 from kiln_workers.fit.solvers.pixels import Pixels, PixelSet
 from kiln_workers.fit.solvers.starts import unconstrain

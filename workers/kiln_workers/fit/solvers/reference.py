@@ -1,8 +1,8 @@
 """Per-texel L-BFGS on all parameters, run to convergence: the strongest reference for the attainable error.
 
 The problem is not convex, so where it ends depends on where it starts. It is run from each of several starts, and each
-texel keeps its best end: the shared even picture, and whatever lobes are given (another solver's, say). Like
-gradient descent from independent starts it is a reference for the error at texels, not between them.
+texel keeps its best end: the shared even picture, what expectation-maximisation finds, whatever lobes are given
+(another solver's, say), and random ones. It is a reference for the error at texels, not between them.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from kiln_workers.fit.field import TexelField
 from kiln_workers.fit.lobes import constrain
 from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, nobody
 from kiln_workers.fit.solvers.losses import raw_losses
+from kiln_workers.fit.solvers.mixture import em
 from kiln_workers.fit.solvers.pixels import PixelSet
 from kiln_workers.fit.solvers.quasi_newton import BatchedLbfgs, Stopping
 from kiln_workers.fit.solvers.starts import random_start, shared_start, unconstrain
@@ -26,20 +27,26 @@ def lbfgs(
     lobes: int,
     on_epoch: OnEpoch = nobody,
     *,
+    mixture_start: bool = True,
     given: Sequence[Tensor] = (),
     random_starts: int = 0,
     stopping: Stopping = Stopping(),
 ) -> Solution:
-    """From the shared start, from `given` lobes [T, N, 7], and from random ones. An epoch is T evaluations."""
+    """From the shared start, EM's outcome, `given` lobes [T, N, 7] and random ones. An epoch is T evaluations."""
     watch = Stopwatch(on_epoch)
     pixels = PixelSet(field)
     normals = torch.from_numpy(field.normals)
     starts = [shared_start(field, lobes)]
+    evaluations = 0
+    if mixture_start:
+        mixture = em(field, lobes)
+        evaluations += mixture.epochs * len(field)
+        starts.append(unconstrain(mixture.representation.parameters, normals))
     starts += [unconstrain(start, normals) for start in given]
     starts += [random_start(field, lobes, seed) for seed in range(random_starts)]
     best = torch.full((len(field),), torch.inf)
     raw = starts[0]
-    evaluations = epochs = 0
+    epochs = evaluations // len(field)
     for start in starts:
         problem = BatchedLbfgs(_Evaluation(pixels, normals, lobes), start.flatten(1), stopping)
         while len(problem.active):

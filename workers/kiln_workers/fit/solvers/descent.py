@@ -29,7 +29,7 @@ from kiln_workers.fit.solvers.pixels import Pixels, PixelSet
 from kiln_workers.fit.solvers.starts import random_start, shared_start
 from kiln_workers.fit.solvers.stopwatch import Stopwatch
 
-ALIGNMENT: Final = 0.03
+ALIGNMENT: Final = 0.1
 EPSILON: Final = 1e-10
 """Smaller than the network's: a dark texel's gradients are tiny."""
 
