@@ -38,7 +38,7 @@ _JITTER_STREAM: Final = 0x6A6974
 
 @dataclass(frozen=True)
 class AdamOptions:
-    steps: int = 1000
+    steps: int = 400
     rate: float = 0.05
     """Learning rate at its peak."""
     jitter: bool = False
