@@ -9,14 +9,17 @@ given directions. Everything is exposure-normalised. A solver is a function
 that calls `on_epoch` after each pass over all texels; the same field gives the same bytes.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from kiln_workers.fit.loss import lobe_values
+from kiln_workers.sphere import harmonics
 
 
 class Representation(Protocol):
@@ -36,6 +39,10 @@ class Representation(Protocol):
 
     def mixed(self, corners: Tensor, weights: Tensor) -> "Representation":
         """What a bilinear fetch gives at B points: texels `corners` [B, 4] with `weights` [B, 4]."""
+        ...
+
+    def take(self, chosen: Tensor) -> "Representation":
+        """Some of the texels."""
         ...
 
     def values(self, directions: Tensor) -> Tensor:
@@ -64,8 +71,36 @@ class Lobes:
         unit = torch.where(length > 1e-6, axis / length.clamp(min=1e-6), axis.new_tensor([0.0, 1.0, 0.0]))
         return Lobes(torch.cat([unit, mixed[..., 3:]], dim=-1))
 
+    def take(self, chosen: Tensor) -> "Lobes":
+        return Lobes(self.parameters[chosen])
+
     def values(self, directions: Tensor) -> Tensor:
         return lobe_values(self.parameters, directions)[1]
+
+
+@dataclass(frozen=True)
+class Harmonics:
+    """Coefficients [T, L^2, 3] of real spherical harmonics (`sphere.harmonics`); negative radiance counts as none."""
+
+    parameters: Tensor
+
+    @property
+    def floats_per_texel(self) -> int:
+        return int(self.parameters.shape[1] * self.parameters.shape[2])
+
+    def rounded(self) -> "Harmonics":
+        return Harmonics(self.parameters.half().float())
+
+    def mixed(self, corners: Tensor, weights: Tensor) -> "Harmonics":
+        return Harmonics((self.parameters[corners] * weights[:, :, None, None]).sum(1))
+
+    def take(self, chosen: Tensor) -> "Harmonics":
+        return Harmonics(self.parameters[chosen])
+
+    def values(self, directions: Tensor) -> Tensor:
+        bands = math.isqrt(self.parameters.shape[1])
+        values = harmonics.basis(directions.double().numpy(), bands).astype(np.float32)
+        return (torch.from_numpy(values) @ self.parameters).clamp(min=0.0)
 
 
 @dataclass(frozen=True)

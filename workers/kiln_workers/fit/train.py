@@ -86,8 +86,13 @@ def train(
     on_checkpoint: Callable[[bytes], None] = lambda _: None,
     on_progress: Callable[[Progress], None] = lambda _: None,
     checkpoint_every_s: float = 60.0,
+    exposure: float | None = None,
+    on_epoch: Callable[[int, Weights], None] | None = None,
 ) -> FitOutcome:
-    """Fit one function; FitFailed where it does not clearly beat P = 0, InputError where there are no texels."""
+    """Fit one function; FitFailed where it does not clearly beat P = 0, InputError where there are no texels.
+
+    `exposure` is that of the source unless given; `on_epoch` is shown the weights after each pass over the texels.
+    """
     began = time.monotonic()
     if not sum(source.counts):
         raise InputError(
@@ -106,7 +111,9 @@ def train(
     if checkpoint is not None:
         state = _restore(checkpoint, identity)
     else:
-        state = _State(0, Adam.start(initial_parameters(shape, seed)), exposure_of(source, function))
+        if exposure is None:
+            exposure = exposure_of(source, function)
+        state = _State(0, Adam.start(initial_parameters(shape, seed)), exposure)
     began -= state.seconds
     with single_threaded_pool(threads) as pool:
         if checkpoint is None and _errors(source, None, state.exposure, pool).log_mse_zero < NO_SIGNAL:
@@ -117,10 +124,13 @@ def train(
         for batch in islice(stream.batches(state.step), settings.steps - state.step):
             trainer.step(batch)
             on_progress(_progress(state, settings))
+            epoch, inside = divmod(state.step * settings.batch, sum(source.counts))
+            if on_epoch is not None and inside < settings.batch:
+                on_epoch(epoch, _weights(shape, state))
             if time.monotonic() - last_saved >= checkpoint_every_s and state.step < settings.steps:
                 on_checkpoint(_save(state, identity, time.monotonic() - began))
                 last_saved = time.monotonic()
-        weights = Weights(shape, state.exposure, True, state.adam.parameters.cpu().numpy())
+        weights = _weights(shape, state)
         errors = _errors(source, weights, state.exposure, pool)
     _refuse_failure(errors, function, settings)
     return FitOutcome(
@@ -175,6 +185,10 @@ class _Trainer:
         loss = log_loss(lobes, log_targets, directions, weights)
         gradients = torch.autograd.grad(loss, layers)
         return float(loss.detach()), torch.cat([gradient.reshape(-1) for gradient in gradients])
+
+
+def _weights(shape: Shape, state: _State) -> Weights:
+    return Weights(shape, state.exposure, True, state.adam.parameters.cpu().numpy().copy())
 
 
 def _errors(source: TexelSource, weights: Weights | None, exposure: float, pool: ThreadPoolExecutor) -> TexelErrors:

@@ -1,0 +1,46 @@
+"""The log loss of each texel by itself, with its gradient, over the pixels above its horizon.
+
+The same sum as `fit.loss` (Currius et al. 2020, section 4), but every texel has its own directions [T, K, 3] and its
+own value [T]. It is divided by 2 pi times 3 channels, so a texel's loss is its `log_mse` as docs/mathematics.md
+defines it, apart from the pixels that the horizon cuts.
+"""
+
+import math
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from kiln_workers.fit.lobes import constrain
+
+NORMALISATION: Final = 2.0 * math.pi * 3.0
+
+
+def texel_losses(lobes: Tensor, log_targets: Tensor, directions: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Loss [T] and its gradient [T, N, 7] by lobes [T, N, 7]; log(1 + T) and directions [T, K, 3], weights [T, K]."""
+    axis, sharpness, amplitude = lobes[..., :3], lobes[..., 3:4], lobes[..., 4:]
+    scaled = torch.cat([axis * sharpness, sharpness], dim=-1)
+    homogeneous = torch.cat([directions, -torch.ones_like(directions[..., :1])], dim=-1)  # [T, K, 4]
+    values = torch.bmm(homogeneous, scaled.transpose(1, 2)).exp_()  # [T, K, N]
+    predicted = torch.bmm(values, amplitude)
+    difference = torch.log1p(predicted).sub_(log_targets)
+    weighted = difference * (weights / NORMALISATION)[..., None]
+    losses = (weighted * difference).sum(dim=(1, 2))
+    by_predicted = weighted.mul_(2.0).div_(predicted.add_(1.0))
+    by_amplitude = torch.bmm(values.transpose(1, 2), by_predicted)
+    by_exponent = torch.bmm(by_predicted, amplitude.transpose(1, 2)).mul_(values)
+    by_scaled = torch.bmm(by_exponent.transpose(1, 2), homogeneous)  # [T, N, 4]
+    by_axis = by_scaled[..., :3] * sharpness
+    by_sharpness = (by_scaled[..., :3] * axis).sum(dim=-1, keepdim=True) + by_scaled[..., 3:4]
+    return losses, torch.cat([by_axis, by_sharpness, by_amplitude], dim=-1)
+
+
+def raw_losses(
+    raw: Tensor, normals: Tensor, log_targets: Tensor, directions: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The same by unconstrained parameters [T, N, 7] (`fit.lobes`) of texels with normals [T, 3]."""
+    variable = raw.detach().requires_grad_()
+    lobes = constrain(variable, normals)
+    losses, gradient = texel_losses(lobes.detach(), log_targets, directions, weights)
+    (by_raw,) = torch.autograd.grad(lobes, variable, gradient)
+    return losses, by_raw
