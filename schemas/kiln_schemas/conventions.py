@@ -28,6 +28,9 @@ LAYERS_PER_LOBE: Final = 2
 
 FP16_MAX: Final = 65504.0
 
+REFINE_HALO: Final = 4
+"""Texels around a block that are refined with it and then dropped, so that blocks agree where they meet."""
+
 EXPOSURE_KEY: Final = 0.18
 """The mean radiance above the horizon is scaled to this value before log(1 + x) (Reinhard et al. 2002's key)."""
 
@@ -35,6 +38,7 @@ EXPOSURE_KEY: Final = 0.18
 ARRAY_LIGHT_FIELD: Final = "light_field"
 ARRAY_VISIBILITY: Final = "visibility"
 ARRAY_IRRADIANCE: Final = "irradiance"
+ARRAY_BETWEEN: Final = "between"
 
 # Artifacts of a package.
 LIGHT_FIELD_KTX2: Final = "lightfield.ktx2"

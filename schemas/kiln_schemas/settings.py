@@ -34,6 +34,15 @@ class UvPolicy(StrEnum):
     """Always unwrap."""
 
 
+class Solver(StrEnum):
+    """How the light field's lobes are found."""
+
+    COHERENT = "coherent"
+    """The network as the start, then gradient descent on all lobes at once, at texels and between them."""
+    CNN = "cnn"
+    """The network's own output (Currius et al. 2020)."""
+
+
 class LightmapSettings(Contract):
     """The light map: one atlas for the whole scene."""
 
@@ -49,6 +58,9 @@ class RenderSettings(Contract):
     image_size: int = Field(ge=16, le=256, description="pixels along each side of a light-field image")
     samples: int = Field(default=16, ge=1, le=65536, description="paths per light-field pixel")
     irradiance_samples: int = Field(default=1024, ge=1, le=1_000_000, description="paths per texel")
+    between_samples: int = Field(
+        default=64, ge=0, le=65536, description="paths per pixel of the sparse light fields between texels; 0: none"
+    )
     max_depth: int = Field(default=6, ge=1, le=64, description="scattering events on a path, at most")
 
     @field_validator("image_size")
@@ -60,14 +72,17 @@ class RenderSettings(Contract):
 
 
 class FitSettings(Contract):
-    """Training of the network that turns light-field images into lobes."""
+    """How light-field images become lobes: the training of the network, and the descent that starts from it."""
 
+    solver: Solver = Solver.COHERENT
     lobes: int = Field(ge=1, le=64, description="spherical Gaussians per texel")
     steps: int = Field(ge=1, le=1_000_000, description="optimiser steps of the light field's network")
     visibility_steps: int = Field(default=1000, ge=1, le=1_000_000, description="of the visibility's: it is far easier")
     batch: int = Field(default=32, ge=1, le=1024, description="texels per step")
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
     window: int = Field(default=4096, ge=1, le=1_000_000, description="texels in the shuffle window")
+    refine_steps: int = Field(default=600, ge=1, le=1_000_000, description="steps of the coherent descent")
+    block: int = Field(default=32, ge=8, le=256, description="texels along each side of a refine task's block")
     checkpoint_s: float = Field(default=60.0, ge=1.0, le=3600.0, description="seconds between checkpoints")
 
 

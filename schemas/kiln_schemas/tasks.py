@@ -24,6 +24,7 @@ class TaskKind(StrEnum):
     PREPARE = "prepare"
     RENDER = "render"
     FIT = "fit"
+    REFINE = "refine"
     PACKAGE = "package"
 
 
@@ -42,6 +43,14 @@ class Bundle(Contract):
     entry: BundlePath
     files: dict[BundlePath, Sha256] = Field(min_length=1, max_length=4096)
     environment: EnvironmentRef | None = None
+
+
+class Block(Contract):
+    """A square of the light map that is refined as one task: first row and column, texels along each side."""
+
+    row: int = Field(ge=0)
+    column: int = Field(ge=0)
+    size: int = Field(ge=1)
 
 
 class Tile(Contract):
@@ -64,6 +73,8 @@ class RenderPayload(Contract):
     kind: Literal[TaskKind.RENDER] = TaskKind.RENDER
     scene: Sha256
     texel_map: Sha256
+    between: tuple[Sha256, ...]
+    """Texel maps of the between points, one a kind (`PrepareResult.between`)."""
     tile: Tile
     settings: BakeSettings
     store_url: str
@@ -78,6 +89,20 @@ class FitPayload(Contract):
     store_url: str
 
 
+class RefinePayload(Contract):
+    """Make the lobes of a block coherent, from the network's (`kiln_workers.fit.coherent`)."""
+
+    kind: Literal[TaskKind.REFINE] = TaskKind.REFINE
+    block: Block
+    texel_map: Sha256
+    between: tuple[Sha256, ...]
+    renders: tuple["RenderResult", ...]
+    """Of the tiles within the block and `conventions.REFINE_HALO` texels around it."""
+    fit: "FitResult"
+    settings: BakeSettings
+    store_url: str
+
+
 class PackagePayload(Contract):
     kind: Literal[TaskKind.PACKAGE] = TaskKind.PACKAGE
     job_id: str
@@ -86,13 +111,15 @@ class PackagePayload(Contract):
     prepare: "PrepareResult"
     renders: tuple["RenderResult", ...]
     fits: tuple["FitResult", ...]
+    refines: tuple["RefineResult", ...]
+    """Of the light field, one a block; none where the network's lobes are final."""
     settings: BakeSettings
     store_url: str
     gates: Gates = Gates()
     cameras: Cameras = Field(default_factory=dict)
 
 
-Payload = Annotated[PreparePayload | RenderPayload | FitPayload | PackagePayload, Field(discriminator="kind")]
+Payload = Annotated[PreparePayload | RenderPayload | FitPayload | RefinePayload | PackagePayload, Field(discriminator="kind")]
 
 
 class PrepareResult(Contract):
@@ -101,6 +128,8 @@ class PrepareResult(Contract):
     """The parsed scene (`kiln_workers.scene.archive`)."""
     texel_map: Sha256
     """The texel map (`kiln_workers.scene.texels`)."""
+    between: tuple[Sha256, ...] = ()
+    """Texel maps of the points half-way between texels: to the right, below, and the corner; none where unused."""
     scene_hash: Sha256
     """Hash of all that the light depends on; render seeds derive from it."""
     tiles: tuple[Tile, ...]
@@ -155,6 +184,16 @@ class FitResult(Contract):
     seconds: float
 
 
+class RefineResult(Contract):
+    kind: Literal[TaskKind.REFINE] = TaskKind.REFINE
+    block: Block
+    lobes: Sha256
+    """Lobes [T, N, 7] in scene units of the block's T valid texels, row by row (`kiln_workers.fit.coherent`)."""
+    texels: int
+    steps: int
+    seconds: float
+
+
 class Artifact(Contract):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", max_length=200)]
     sha256: Sha256
@@ -170,7 +209,7 @@ class PackageResult(Contract):
     seconds: float
 
 
-Result = Annotated[PrepareResult | RenderResult | FitResult | PackageResult, Field(discriminator="kind")]
+Result = Annotated[PrepareResult | RenderResult | FitResult | RefineResult | PackageResult, Field(discriminator="kind")]
 
 
 class Progress(Contract):
