@@ -34,6 +34,19 @@ class BetweenPoints:
 
 
 @dataclass(frozen=True)
+class BetweenTargets:
+    """Light fields traced at B of a field's between points, one pixel of each 2 x 2 block."""
+
+    points: Index  # [B] into `TexelField.between`
+    normals: Float32  # [B, 3] unit, geometric, at the point itself
+    offsets: Index  # [B, 2] row and column in the block of the pixel that was traced
+    images: Float16  # [B, R / 2, R / 2, 3] in scene units
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
 class TexelField:
     """T valid texels of one function."""
 
@@ -43,6 +56,8 @@ class TexelField:
     chart: Index  # [T]
     exposure: float
     """Factor from scene radiance to the exposure-normalised radiance of loss and metrics."""
+    traced: BetweenTargets | None = None
+    """What a solver may learn from about the points between; never what `log_mse_between` is measured against."""
 
     def __len__(self) -> int:
         return len(self.images)
@@ -77,7 +92,7 @@ class TexelField:
         return BetweenPoints(corners, steps, first)
 
     def take(self, chosen: Index) -> "TexelField":
-        """Some of the texels."""
+        """Some of the texels, without what was traced between them."""
         return TexelField(
             self.images[chosen], self.normals[chosen], self.place[chosen], self.chart[chosen], self.exposure
         )

@@ -50,6 +50,18 @@ class Representation(Protocol):
         ...
 
 
+def mixed_lobes(lobes: Tensor, corners: Tensor, weights: Tensor) -> Tensor:
+    """Bilinear mix [B, N, 7] of lobes [T, N, 7] of texels `corners` [B, 4] with `weights` [B, 4].
+
+    Axes are normalised after mixing, as the shader does; one that vanishes becomes +Y.
+    """
+    mixed = (lobes[corners] * weights[:, :, None, None]).sum(1)
+    axis = mixed[..., :3]
+    length = torch.linalg.norm(axis, dim=-1, keepdim=True)
+    unit = torch.where(length > 1e-6, axis / length.clamp(min=1e-6), axis.new_tensor([0.0, 1.0, 0.0]))
+    return torch.cat([unit, mixed[..., 3:]], dim=-1)
+
+
 @dataclass(frozen=True)
 class Lobes:
     """Spherical Gaussians [T, N, 7]: unit axis, sharpness, amplitudes."""
@@ -64,12 +76,7 @@ class Lobes:
         return Lobes(self.parameters.half().float())
 
     def mixed(self, corners: Tensor, weights: Tensor) -> "Lobes":
-        """Axes are normalised after mixing, as the shader does; one that vanishes becomes +Y."""
-        mixed = (self.parameters[corners] * weights[:, :, None, None]).sum(1)
-        axis = mixed[..., :3]
-        length = torch.linalg.norm(axis, dim=-1, keepdim=True)
-        unit = torch.where(length > 1e-6, axis / length.clamp(min=1e-6), axis.new_tensor([0.0, 1.0, 0.0]))
-        return Lobes(torch.cat([unit, mixed[..., 3:]], dim=-1))
+        return Lobes(mixed_lobes(self.parameters, corners, weights))
 
     def take(self, chosen: Tensor) -> "Lobes":
         return Lobes(self.parameters[chosen])

@@ -1,4 +1,5 @@
-"""The solvers that Currius et al. 2020 compare with, on the same stored light fields with the same loss.
+"""Our solver, the paper's, and those that Currius et al. 2020 compare with, on the same stored
+light fields with the same loss.
 
 Each is `solve(field, lobes, on_epoch, *, options)` as `fit.solution` defines it.
 """
@@ -7,6 +8,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from kiln_workers.fit.solution import Solver
+from kiln_workers.fit.solvers.coherent import coherent
 from kiln_workers.fit.solvers.descent import adam, adam_aligned, adam_random
 from kiln_workers.fit.solvers.encoder import cnn
 from kiln_workers.fit.solvers.fixed_lobes import fixed, fixed_12, fixed_log
@@ -15,6 +17,7 @@ from kiln_workers.fit.solvers.mixture import em, em_aligned
 from kiln_workers.fit.solvers.reference import lbfgs
 
 SOLVERS: Final[Mapping[str, Solver]] = {
+    "coherent": coherent,
     "cnn": cnn,
     "adam": adam,
     "adam-random": adam_random,

@@ -61,6 +61,13 @@ class Pixels:
             self.size, self.index[chosen], self.weights[chosen], self.log_targets[chosen], self.normals[chosen]
         )
 
+    def every(self, stride: int, first: int) -> "Pixels":
+        """One pixel of each `stride` in a row, from `first` on; the weights stay as they are."""
+        chosen = slice(first, None, stride)
+        return Pixels(
+            self.size, self.index[:, chosen], self.weights[:, chosen], self.log_targets[:, chosen], self.normals
+        )
+
     def _look_up(self, table: Tensor) -> Tensor:
         return table.index_select(0, self.index.flatten()).view(*self.index.shape, 3)
 

@@ -1,0 +1,221 @@
+"""Our own solver: gradient descent on the lobes of all texels at once, for the light field that the screen shows.
+
+The screen shows lobes that were interpolated, so half of the loss is taken where interpolation errs most: half-way
+between neighbouring texels, on bilinearly mixed lobes with normalised axes, against light fields that were traced there
+(`TexelField.traced`), or the mean of the texels around where none were. Nothing in the papers does that. The other half
+is the paper's log loss at the texels.
+
+    sum over texels of loss(lobes_t) + sum over between points of loss(mean of lobes_c) + alignment(step) sum |u - m|^2
+
+The last term is that of Green et al. 2006, which pulls each axis towards the mean m of the same lobe's axes in the
+neighbours. It is strong at first, so that lobes move through the light field together, as one lobe of a chart, and
+decays to almost nothing, so that it does not blur what they end as. Each step looks at a random subset of the pixels
+above each horizon, one of `stride` in a row, which costs an eighth of all and serves as well.
+
+The start is the network's output, which is coherent over the whole light map; so blocks that are solved apart from each
+other, with a margin of their neighbours' texels that is dropped afterwards, agree where they meet.
+docs/design/fit.md has the measurements behind every number here.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kiln_workers.fit.field import BetweenTargets, TexelField
+from kiln_workers.fit.lobes import constrain
+from kiln_workers.fit.metrics import horizon_weights
+from kiln_workers.fit.optimizer import BETA_1, BETA_2, one_cycle
+from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, mixed_lobes, nobody
+from kiln_workers.fit.solvers.alignment import Neighbourhood
+from kiln_workers.fit.solvers.encoder import cnn
+from kiln_workers.fit.solvers.losses import texel_losses
+from kiln_workers.fit.solvers.pixels import Pixels, gather
+from kiln_workers.fit.solvers.starts import unconstrain
+from kiln_workers.fit.solvers.stopwatch import Stopwatch
+from kiln_workers.fit.source import Index
+from kiln_workers.fit.threads import single_threaded_pool
+
+RATE: Final = 0.1
+ALIGNMENT: Final = (0.3, 0.01)
+"""Weight of the alignment at the first and at the last step; it falls exponentially."""
+TEXEL_PIXELS: Final = 512
+"""Pixels of a texel that one step looks at, at least."""
+BETWEEN_PIXELS: Final = 128
+"""Pixels of a between point that one step looks at, at least."""
+EPSILON: Final = 1e-10
+
+_STREAM: Final = 0x636F68
+_TEXELS: Final = 64
+_POINTS: Final = 256
+
+
+@dataclass(frozen=True)
+class CoherentOptions:
+    steps: int = 600
+    rate: float = RATE
+    alignment: tuple[float, float] = ALIGNMENT
+
+
+def coherent(
+    field: TexelField,
+    lobes: int,
+    on_epoch: OnEpoch = nobody,
+    *,
+    start: Tensor | None = None,
+    options: CoherentOptions = CoherentOptions(),
+    seed: int = 0,
+) -> Solution:
+    """From exposure-normalised lobes `start` [T, N, 7]; without, the network is trained on the field first.
+
+    Epochs and seconds are then those of both together.
+    """
+    watch, before = Stopwatch(on_epoch), 0
+    if start is None:
+        trained = cnn(field, lobes, on_epoch, seed=seed)
+        start, before = trained.representation.parameters, trained.epochs
+    done = before
+
+    def tell(step: int, raw: Tensor) -> None:
+        nonlocal done
+        done = before + step
+        watch.tell(done, lambda: Lobes(constrain(raw, torch.from_numpy(field.normals))))
+
+    found = descend(field, start, options, seed, threads=torch.get_num_threads(), on_step=tell)
+    return Solution(Lobes(found), done, watch.seconds)
+
+
+def descend(
+    field: TexelField,
+    start: Tensor,
+    options: CoherentOptions,
+    seed: int,
+    *,
+    threads: int = 1,
+    on_step: Callable[[int, Tensor], None] = lambda step, raw: None,
+) -> Tensor:
+    """Lobes [T, N, 7] from exposure-normalised `start` [T, N, 7]; `on_step` gets the steps done and the parameters.
+
+    The same bytes on any number of threads: each chunk of texels is computed by one, with single-threaded kernels.
+    """
+    if not len(field):
+        return start.clone()
+    normals = torch.from_numpy(field.normals)
+    with single_threaded_pool(threads) as pool:
+        problem = _Problem(field, pool)
+        raw = unconstrain(start, normals)
+        mean, square = torch.zeros_like(raw), torch.zeros_like(raw)
+        for step in range(options.steps):
+            rng = np.random.default_rng([seed, _STREAM, step])
+            fraction = step / options.steps
+            alignment = options.alignment[0] * (options.alignment[1] / options.alignment[0]) ** fraction
+            variable = raw.detach().requires_grad_()
+            lobes = constrain(variable, normals)
+            gradient = problem.gradient(lobes.detach(), rng) + problem.alignment_gradient(lobes.detach(), alignment)
+            (by_raw,) = torch.autograd.grad(lobes, variable, gradient)
+            mean.lerp_(by_raw, 1.0 - BETA_1)
+            square.mul_(BETA_2).addcmul_(by_raw, by_raw, value=1.0 - BETA_2)
+            denominator = (square / (1.0 - BETA_2 ** (step + 1))).sqrt_().add_(EPSILON)
+            rate = one_cycle(step, options.steps, options.rate) / (1.0 - BETA_1 ** (step + 1))
+            raw.addcdiv_(mean, denominator, value=-rate)
+            on_step(step + 1, raw)
+        return constrain(raw, normals)
+
+
+class _Problem:
+    """The loss of a field: its pixels, gathered once, and its gradient by lobes."""
+
+    def __init__(self, field: TexelField, pool: ThreadPoolExecutor) -> None:
+        self._pool, self._field = pool, field
+        self._neighbourhood = Neighbourhood(field)
+        texels = _split(len(field), _TEXELS)
+        self._texels = list(zip(texels, pool.map(lambda part: gather(field, part), texels), strict=True))
+        targets = field.traced if field.traced is not None else mean_targets(field)
+        self._corners = torch.from_numpy(field.between.corners[targets.points])
+        points = _split(len(targets), _POINTS)
+        found = pool.map(lambda part: _gather_between(field, targets, part), points)
+        self._points = list(zip(points, found, strict=True))
+
+    def gradient(self, lobes: Tensor, rng: np.random.Generator) -> Tensor:
+        """[T, N, 7] of both losses by lobes [T, N, 7], from a random subset of the pixels."""
+        out = torch.empty_like(lobes)
+        self._add_up(out, lobes, self._texels, TEXEL_PIXELS, rng)
+        if self._points:
+            variable = lobes.requires_grad_()
+            mixed = mixed_lobes(variable, self._corners, lobes.new_full((len(self._corners), 4), 0.25))
+            by_mixed = torch.empty_like(mixed)
+            self._add_up(by_mixed, mixed.detach(), self._points, BETWEEN_PIXELS, rng)
+            out += torch.autograd.grad(mixed, variable, by_mixed)[0]
+        return out
+
+    def alignment_gradient(self, lobes: Tensor, weight: float) -> Tensor:
+        """[T, N, 7] of weight / N sum |u - m|^2, m held fixed."""
+        out = torch.zeros_like(lobes)
+        axes = lobes[..., :3]
+        out[..., :3] = (2.0 * weight / lobes.shape[1]) * (axes - self._neighbourhood.mean_axes(axes))
+        return out
+
+    def _add_up(
+        self,
+        out: Tensor,
+        lobes: Tensor,
+        parts: list[tuple[Index, Pixels]],
+        pixels: int,
+        rng: np.random.Generator,
+    ) -> None:
+        """Fill `out` [M, N, 7] with the gradients by `lobes` [M, N, 7], chunk by chunk."""
+        strides = [max(1, part.index.shape[1] // pixels) for _, part in parts]
+        firsts = [int(rng.integers(stride)) for stride in strides]
+
+        def work(number: int) -> None:
+            (where, part), stride, first = parts[number], strides[number], firsts[number]
+            chosen = part.every(stride, first)
+            at = slice(int(where[0]), int(where[-1]) + 1)
+            out[at] = texel_losses(lobes[at], chosen.log_targets, chosen.centres(), chosen.weights * stride)[1]
+
+        for _ in self._pool.map(work, range(len(parts))):
+            pass
+
+
+def mean_targets(field: TexelField) -> BetweenTargets:
+    """What is taken for the light fields at all between points where none were traced: the mean of their corners'."""
+    between, half = field.between, field.image_size // 2
+    images = np.empty((len(between), half, half, 3), np.float16)
+    offsets = np.stack(np.divmod(np.arange(len(between)) % 4, 2), axis=1)
+    for offset in np.unique(offsets, axis=0):
+        at = np.flatnonzero((offsets == offset).all(axis=1))
+        for part in np.array_split(at, max(1, len(at) // _POINTS)):
+            seen = field.images[:, offset[0] :: 2, offset[1] :: 2][between.corners[part]]
+            images[part] = seen.astype(np.float32).mean(axis=1).astype(np.float16)
+    normals = field.normals[between.corners].mean(axis=1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)
+    return BetweenTargets(np.arange(len(between)), normals.astype(np.float32), offsets, images)
+
+
+def _gather_between(field: TexelField, targets: BetweenTargets, part: Index) -> Pixels:
+    """The pixels of some between points that were traced and whose centre is above the horizon there."""
+    size, half = field.image_size, field.image_size // 2
+    normals = torch.from_numpy(targets.normals[part])
+    rows = 2 * np.arange(half)[None, :, None] + targets.offsets[part, 0][:, None, None]
+    columns = 2 * np.arange(half)[None, None, :] + targets.offsets[part, 1][:, None, None]
+    pixel = torch.from_numpy((rows * size + columns).reshape(len(part), -1))  # [B, K] of the whole image
+    weights = 4.0 * horizon_weights(normals, size).gather(1, pixel)
+    most = int((weights > 0.0).sum(dim=1).max())
+    order = torch.argsort((weights <= 0.0).to(torch.int8), dim=1, stable=True)[:, :most]
+    images = torch.from_numpy(targets.images[part]).flatten(1, 2)
+    radiance = images.gather(1, order[..., None].expand(-1, -1, 3)).float()
+    return Pixels(
+        size,
+        pixel.gather(1, order).to(torch.int32),
+        weights.gather(1, order),
+        radiance.mul_(field.exposure).log1p_(),
+        normals,
+    )
+
+
+def _split(count: int, most: int) -> list[Index]:
+    return [np.arange(start, min(start + most, count), dtype=np.int64) for start in range(0, count, most)]
