@@ -61,12 +61,14 @@ def test_shade_writes_what_it_says(package_folder: Path, tmp_path: Path, capfd) 
     assert (told["width"], told["height"], told["source"]) == (32, 20, "textures") and "psnr" not in told
     assert read_exr(picture).shape == (20, 32, 3) and read_exr(picture).max() > 3.0
     assert main([*command, "-o", str(again), "--against", str(picture)]) == 0
-    assert json.loads(capfd.readouterr().out)["psnr"] is None  # nothing differs
+    told = json.loads(capfd.readouterr().out)
+    assert (told["psnr"], told["ssim"], told["flip"]) == (None, 1.0, 0.0)  # nothing differs
     assert oiio.ImageInput.open(str(again)).spec().nchannels == 3
     darker = tmp_path / "darker.exr"
     write_rgb(darker, 0.9 * read_exr(picture))
     assert main([*command, "-o", str(again), "--against", str(darker)]) == 0
-    assert 20.0 < json.loads(capfd.readouterr().out)["psnr"] < 45.0
+    told = json.loads(capfd.readouterr().out)
+    assert 20.0 < told["psnr"] < 45.0 and 0.5 < told["ssim"] < 1.0 and 0.0 < told["flip"] < 0.5
 
 
 def test_terms_add_up(package_folder: Path, tmp_path: Path, capfd) -> None:

@@ -16,7 +16,9 @@ def add_commands(commands: Any) -> None:
     shading.add_argument("--grid", type=_positive, default=2, help="N x N samples a pixel")
     shading.add_argument("--terms", default=",".join(WHOLE), help=f"some of {','.join(Term)}")
     shading.add_argument("--stored", help="light-field store to take the light from instead of the lobes")
-    shading.add_argument("--against", type=Path, help="EXR of the same camera to measure the PSNR against")
+    shading.add_argument(
+        "--against", type=Path, help="EXR of the same camera to measure PSNR, SSIM and HDR-FLIP against"
+    )
     shading.set_defaults(command=_run_shade)
 
     tracing = commands.add_parser("reference", help="path-trace a scene and state the picture's noise")

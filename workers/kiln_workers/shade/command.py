@@ -18,7 +18,8 @@ from kiln_workers.scene.load import check_light, load_scene
 from kiln_workers.scene.model import Environment, Scene
 from kiln_workers.shade.camera import read_camera
 from kiln_workers.shade.gbuffer import render_gbuffer
-from kiln_workers.shade.image_files import check_output, psnr, write_picture
+from kiln_workers.shade.image_files import check_output, write_picture
+from kiln_workers.shade.image_metrics import compare_pictures, flip_noise_floor, psnr
 from kiln_workers.shade.package import ShadePackage, read_exr
 from kiln_workers.shade.picture import shade
 from kiln_workers.shade.reference import path_trace
@@ -58,7 +59,7 @@ def run_shade(options: argparse.Namespace) -> int:
         "seconds": round(time.perf_counter() - began, 3),
     }
     if against is not None:
-        told["psnr"] = _finite(psnr(picture, against, white))
+        told |= compare_pictures(against, picture, white).rounded()
     _tell(told, options.json)
     return 0
 
@@ -81,6 +82,7 @@ def run_reference(options: argparse.Namespace) -> int:
         "max_depth": options.max_depth,
         "psnr_of_halves": _finite(psnr(*made.halves, white)),
         "rms_noise": made.rms_noise,
+        "flip_noise_floor": round(float(flip_noise_floor(made.halves).mean()), 5),
         "white": white,
         "seconds": round(time.perf_counter() - began, 3),
     }
@@ -141,8 +143,11 @@ def _tell(told: dict[str, Any], as_json: bool) -> None:
     print(told["out"])
     words = {
         "psnr": "PSNR against the given picture: {} dB",
+        "ssim": "SSIM: {}",
+        "flip": "HDR-FLIP: {}",
         "psnr_of_halves": "PSNR between two halves: {} dB",
         "rms_noise": "noise of the picture (RMS over mean): {}",
+        "flip_noise_floor": "HDR-FLIP that this noise alone makes: {}",
         "seconds": "seconds: {}",
     }
     for key, sentence in words.items():

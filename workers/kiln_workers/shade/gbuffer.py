@@ -41,6 +41,14 @@ class GBuffer:
     def __len__(self) -> int:
         return len(self.position)
 
+    def pixel_alpha(self) -> Float32:
+        """GGX width of each pixel [H, W]; NaN where its samples differ by more than 1 %, or some met no surface."""
+        alpha = np.full(self.hit.shape, np.nan, np.float32)
+        alpha[self.hit] = self.alpha
+        low, high = alpha.min(axis=2), alpha.max(axis=2)
+        with np.errstate(invalid="ignore"):
+            return np.where(high <= 1.01 * low, 0.5 * (low + high), np.float32(np.nan)).astype(np.float32)
+
 
 def render_gbuffer(
     scene: Scene, camera: Camera, width: int, height: int, grid: int = 2, device: Device = "auto"

@@ -1,4 +1,4 @@
-"""Pictures in and out: EXR for measuring, PNG for looking at, and the PSNR between two of them.
+"""Pictures in and out: EXR for measuring, PNG for looking at.
 
 A PNG is tone-mapped (`package.colour`), which takes a luminance that shows as white. Two pictures can only be compared
 with the same one, so whoever makes several passes the first one's on.
@@ -6,8 +6,6 @@ with the same one, so whoever makes several passes the first one's on.
 
 from pathlib import Path
 from typing import Final
-
-import numpy as np
 
 from kiln_schemas.errors import InputError
 from kiln_workers.package import colour, exr, png
@@ -32,10 +30,3 @@ def write_picture(path: Path, radiance: Float32, white: float) -> None:
         write_bytes(path, png.encode(colour.tone_map(radiance, white)))
     else:
         exr.write_rgb(path, radiance, comments="radiance, linear Rec.709")
-
-
-def psnr(one: Float32, other: Float32, white: float) -> float:
-    """Peak signal-to-noise ratio in dB of the display-mapped pictures [H, W, 3]; infinite where they are equal."""
-    difference = colour.tone_map(one, white).astype(np.float64) - colour.tone_map(other, white)
-    error = float(np.mean(np.square(difference / 255.0)))
-    return float("inf") if error == 0.0 else -10.0 * float(np.log10(error))
