@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from kiln_workers.fit.field import TexelField
 from kiln_workers.fit.source import ArraySource
 from kiln_workers.sphere import gaussian, octahedral
 
@@ -35,3 +36,24 @@ def made_of_lobes(texels: int, size: int = SIZE) -> tuple[np.ndarray, np.ndarray
 @pytest.fixture
 def lobe_source() -> ArraySource:
     return ArraySource(*made_of_lobes(40), tile=16)
+
+
+@pytest.fixture(scope="session")
+def lobe_field() -> TexelField:
+    """A flat chart of 3 x 4 texels, two lobes a texel whose axes turn by some 6 degrees from texel to texel."""
+    place = np.argwhere(np.ones((3, 4), bool))
+    normals = np.tile(np.float32([0.0, 1.0, 0.0]), (len(place), 1))
+    row, column = place.T.astype(np.float64)
+
+    def turning(axis: list[float], sharpness: float, amplitude: list[float]) -> np.ndarray:
+        axes = np.array(axis) + 0.1 * np.stack([column, 0.0 * row, row], axis=1)
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        return np.concatenate([axes, np.tile([sharpness, *amplitude], (len(place), 1))], axis=1)
+
+    lobes = np.stack(
+        [turning([-0.6, 1.0, 0.2], 25.0, [4.0, 3.0, 1.0]), turning([0.5, 0.7, -0.4], 8.0, [0.5, 1.0, 2.0])], axis=1
+    )
+    directions = octahedral.pixel_directions(SIZE).reshape(-1, 3)
+    images = gaussian.evaluate(directions, lobes) * (normals @ directions.T > 0.0)[..., None]
+    chart = np.zeros(len(place), np.int64)
+    return TexelField(images.reshape(-1, SIZE, SIZE, 3).astype(np.float16), normals, place, chart, 0.7)

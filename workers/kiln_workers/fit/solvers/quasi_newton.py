@@ -33,6 +33,8 @@ class Stopping:
     """Iterations over which the decrease is measured."""
     tolerance: float = 1e-4
     """Relative decrease within the window below which a problem has converged."""
+    floor: float = 1e-8
+    """Value below which nothing is left to minimise."""
 
 
 class BatchedLbfgs:
@@ -126,4 +128,5 @@ class BatchedLbfgs:
         again = at[stuck & informed]
         self._inverse[again] = 0.0
         self._turn(again)
-        self.active = at[~(slow | (stuck & ~informed) | (count >= stopping.iterations))]
+        done = slow | (self.values[at] < stopping.floor)
+        self.active = at[~(done | (stuck & ~informed) | (count >= stopping.iterations))]
