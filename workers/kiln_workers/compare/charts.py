@@ -77,8 +77,8 @@ def error_curves(series: Sequence[Series], label: str) -> Markup:
         at = [f"{across(max(x, 1.0)):.1f},{down(y):.1f}" for x, y in zip(one.epochs, one.errors, strict=True)]
         parts.append(f'<polyline class="line {one.style}" points="{" ".join(at)}"><title>')
         parts.append(f"{escape(one.label)}</title></polyline>")
-        x, y = at[-1].split(",")
-        parts.append(f'<circle class="dot {one.style}" cx="{x}" cy="{y}" r="4"/>')
+        end = across(max(one.epochs[-1], 1.0)), down(one.errors[-1])
+        parts.append(f'<circle class="dot {one.style}" cx="{end[0]:.1f}" cy="{end[1]:.1f}" r="4"/>')
     parts.append("</svg>")
     return Markup("".join(parts))
 

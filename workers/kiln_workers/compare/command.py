@@ -37,7 +37,7 @@ def run_compare(options: argparse.Namespace) -> int:
     width, height = shading.parse_size(options.size)
     subject = open_subject(options.subject, options.package, options.store, options.env)
     # The network is trained as the bake trains it; the other solvers do not depend on the job.
-    known = {**SOLVERS, NETWORK: partial(SOLVERS[NETWORK], settings=subject.settings.fit)}
+    known: dict[str, Solver] = {**SOLVERS, NETWORK: partial(SOLVERS[NETWORK], settings=subject.settings.fit)}
     plan = Plan(
         out=_made(options.out),
         solvers=chosen_solvers(options.solvers, known),

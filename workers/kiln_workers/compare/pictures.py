@@ -1,9 +1,7 @@
 """Pictures of a comparison: each solver's lobes in the package's place, shaded, against the path-traced reference.
 
 The lobes become textures as the packager makes them (scene units, fp16, dilated over the gutters); all else is the
-package's: irradiance, visibility, environment, materials. The reference's own noise is stated as the FLIP between the
-mean of its two halves and a half: they differ by half of the halves' difference, which is as much as the mean itself
-differs from the truth.
+package's: irradiance, visibility, environment, materials. What the reference's own noise gives is stated beside it.
 """
 
 import hashlib
@@ -68,24 +66,20 @@ class View:
     @cached_property
     def masks(self) -> dict[float | None, Bools]:
         """Pixels [H, W] that count: all under None, then those of one material alpha each."""
-        hit, alpha = self.buffer.hit, np.full(self.buffer.hit.shape, np.nan, np.float32)
-        alpha[hit] = np.where(self.buffer.reflects, np.round(self.buffer.alpha, 2), np.nan)
-        first = alpha[..., 0]
-        pure = (alpha == first[..., None]).all(axis=-1)
-        values, counts = np.unique(first[pure], return_counts=True)
-        usual = sorted(values[np.argsort(-counts, kind="stable")][:MOST_ALPHAS].tolist())
-        out: dict[float | None, Bools] = {None: np.ones(first.shape, bool)}
-        for value in usual:
-            mask = pure & (first == np.float32(value))
+        alpha = np.round(self.buffer.pixel_alpha().astype(np.float64), 2)
+        values, counts = np.unique(alpha[np.isfinite(alpha)], return_counts=True)
+        usual = values[np.argsort(-counts, kind="stable")][:MOST_ALPHAS]
+        out: dict[float | None, Bools] = {None: np.ones(alpha.shape, bool)}
+        for value in sorted(usual.tolist()):
+            mask = alpha == value
             if mask.mean() >= LEAST_SHARE:
-                out[round(float(value), 2)] = mask
+                out[value] = mask
         return out
 
     @cached_property
     def noise(self) -> Float32:
         """FLIP [H, W] that the reference's own noise gives."""
-        maps = [image_metrics.flip_map(self.reference.picture, half) for half in self.reference.halves]
-        return np.asarray(0.5 * (maps[0] + maps[1]), np.float32)
+        return image_metrics.flip_noise_floor(self.reference.halves)
 
     def scores(self, picture: Float32) -> tuple[ImageScore, ...]:
         """The picture [H, W, 3] against the reference, whole and per alpha."""
