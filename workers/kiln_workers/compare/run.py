@@ -212,14 +212,10 @@ def _row(found: _Found, name: str, lobes: int, display: Display) -> None:
     display.begin(name, f"{name}, {lobes} lobes")
     solved = kept(found.bench, name, function, lobes)
     fresh = solved is None
-    try:
+    with _failure_noted(found, f"{name}, {lobes} lobes"):
         solved = solved or solve(found.bench, name, function, lobes)
-    except FitFailed as error:
-        found.notes.append(f"{name}, {lobes} lobes: {error}")
-        return
-    finally:
-        display.finish(name, work, fresh=fresh)
-    if any(same.row.solver == name and same.row.lobes == solved.row.lobes for same in found.solved):
+    display.finish(name, work, fresh=fresh)
+    if solved is None or any(same.row.solver == name and same.row.lobes == solved.row.lobes for same in found.solved):
         return
     if found.studio is not None and solved.lobes is not None:
         solved = _shade(found, found.studio, solved, display)
@@ -254,7 +250,8 @@ def _convergence(found: _Found, cache: Cache, display: Display) -> None:
             cache,
             _telling(display, f"light map of {resolution} x {resolution}"),
         )
-        found.resolutions.append(converge(f"{resolution}²", rendered, plan.network, lobes, cache, {}))
+        with _failure_noted(found, f"network, light map of {resolution} x {resolution}"):
+            found.resolutions.append(converge(f"{resolution}²", rendered, plan.network, lobes, cache, {}))
         found.write(complete=False)
     if plan.warm is not None:
         shape = found.subject.store.shape
@@ -263,7 +260,17 @@ def _convergence(found: _Found, cache: Cache, display: Display) -> None:
         nothing: Mapping[str, Any] = {}
         for label, options in (("own start", nothing), (f"from {start.label}", start.options)):
             display.say(f"network, {label}")
-            found.starts.append(converge(label, here, plan.network, lobes, cache, options))
+            with _failure_noted(found, f"network, {label}"):
+                found.starts.append(converge(label, here, plan.network, lobes, cache, options))
+
+
+@contextmanager
+def _failure_noted(found: _Found, what: str) -> Iterator[None]:
+    """A fit that does not beat P = 0 is a finding and no end of the comparison."""
+    try:
+        yield
+    except FitFailed as error:
+        found.notes.append(f"{what}: {error}")
 
 
 def _telling(display: Display, what: str) -> Callable[[float], None]:
