@@ -71,6 +71,7 @@ def test_errors_are_those_of_an_independent_computation(compared: Path, texels: 
     row = rows(compared)["fixed", 6]
     error, zero = log_mse(lobes, field.images, field.normals, field.exposure)
     assert row["log_mse"] == pytest.approx(error, rel=1e-4)
+    assert row["floats_per_texel"] == 3 * 6  # directions and sharpness are common to all texels
     assert row["log_mse_rel"] == pytest.approx(error / zero, rel=1e-4)
     (path,) = (compared / "cache").glob("between-*.bin")
     traced = unpack("between", path.read_bytes())[1]

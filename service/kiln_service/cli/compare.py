@@ -74,8 +74,10 @@ def compare(
     """Compare solvers on a bake's stored light fields: tables, curves and pictures."""
     if JOB_ID.fullmatch(subject) and not Path(subject).exists():
         with options.connect(url, token, data) as api:
+            view = api.job(subject)
+            raise_unless_completed(view)
             store = store or _store(subject, data)
-            package, env = _fetch(api, subject, out, env)
+            package, env = _fetch(api, view, out, env)
         subject = str(package)
     flags: dict[str, object] = {"--out": out, "--solvers": solvers, "--lobes": lobes, "--resolutions": resolutions}
     flags |= {"--resolution-image-size": resolution_image_size, "--size": size, "--tiles": tiles, "--between": between}
@@ -99,24 +101,22 @@ def _store(job: str, data: Path | None) -> str:
     return place.as_uri()
 
 
-def _fetch(api: Api, job: str, out: Path, env: Path | None) -> tuple[Path, Path | None]:
+def _fetch(api: Api, job: JobView, out: Path, env: Path | None) -> tuple[Path, Path | None]:
     """The job's package and its environment's file, downloaded into `out` where they are not there yet."""
-    view = api.job(job)
-    raise_unless_completed(view)
     folder = out / PACKAGE
-    if not _is_package_of(folder, job):
-        download_package(api, job, folder)
-    return folder, env or _environment(api, view, out)
+    if not _is_package_of(folder, job.id):
+        download_package(api, job.id, folder)
+    return folder, env or _environment(api, job, out)
 
 
-def _environment(api: Api, view: JobView, out: Path) -> Path | None:
+def _environment(api: Api, job: JobView, out: Path) -> Path | None:
     """The environment that the job was given, if there is one."""
-    wanted = view.bundle.environment
+    wanted = job.bundle.environment
     if wanted is None:
         return None
     target = out / f"environment{Path(wanted.file).suffix}"
     with writing(out):
-        api.get_blob(view.bundle.files[wanted.file], target)
+        api.get_blob(job.bundle.files[wanted.file], target)
     return target
 
 

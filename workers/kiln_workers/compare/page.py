@@ -16,14 +16,13 @@ from scipy.ndimage import uniform_filter
 
 from kiln_schemas.settings import Function
 from kiln_workers.compare.charts import Series, error_curves, histogram
-from kiln_workers.compare.pictures import View
+from kiln_workers.compare.pictures import Shot, View
 from kiln_workers.compare.result import Comparison, Convergence, Row
 from kiln_workers.compare.solve import Solved
 from kiln_workers.fit.field import TexelField
 from kiln_workers.package import charts, colour
 from kiln_workers.package.preview import TexelPreview
 from kiln_workers.package.report import light_field_pictures
-from kiln_workers.shade import image_metrics
 
 Float32 = npt.NDArray[np.float32]
 UInt8 = npt.NDArray[np.uint8]
@@ -48,8 +47,8 @@ class PageInput:
     texel: Texel
     solved: Sequence[Solved]
     views: Sequence[View]
-    pictures: Mapping[tuple[str, int, str], Float32]
-    """[H, W, 3] by solver, lobes and camera."""
+    shots: Mapping[tuple[str, int, str], Shot]
+    """By solver, lobes and camera."""
 
 
 def render(given: PageInput) -> bytes:
@@ -106,12 +105,11 @@ def _shown(given: PageInput, one: Solved, crops: Sequence[tuple[View, tuple[slic
     _, predicted, difference = _light_field(given.texel, one.shown)
     pictures = []
     for view, place in crops:
-        picture = given.pictures.get((one.row.solver, one.row.lobes, view.name))
-        if picture is not None:
-            error = colour.viridis(image_metrics.flip_map(view.reference.picture, picture)[place] / 0.5)
-            score = next(s for s in one.row.images if s.camera == view.name and s.alpha is None)
-            crop = charts.data_uri(colour.tone_map(picture[place], view.white))
-            pictures.append({"crop": crop, "flip": charts.data_uri(error), "score": score})
+        shot = given.shots.get((one.row.solver, one.row.lobes, view.name))
+        if shot is not None:
+            crop = charts.data_uri(colour.tone_map(shot.picture[place], view.white))
+            error = charts.data_uri(colour.viridis(shot.error[place] / 0.5))
+            pictures.append({"crop": crop, "flip": error, "score": shot.scores[0]})
     uris = {"predicted": charts.data_uri(predicted), "difference": charts.data_uri(difference)}
     return {"row": one.row, "pictures": pictures, **uris}
 

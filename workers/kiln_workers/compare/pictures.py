@@ -50,6 +50,16 @@ class PictureSettings:
 
 
 @dataclass(frozen=True)
+class Shot:
+    """A shaded picture and how far it is from the reference."""
+
+    picture: Float32  # [H, W, 3]
+    error: Float32  # [H, W] FLIP
+    scores: tuple[ImageScore, ...]
+    """Whole and per alpha."""
+
+
+@dataclass(frozen=True)
 class View:
     """One camera: what it sees and what it should look like."""
 
@@ -81,10 +91,11 @@ class View:
         """FLIP [H, W] that the reference's own noise gives."""
         return image_metrics.flip_noise_floor(self.reference.halves)
 
-    def scores(self, picture: Float32) -> tuple[ImageScore, ...]:
-        """The picture [H, W, 3] against the reference, whole and per alpha."""
+    def judge(self, picture: Float32) -> Shot:
+        """The picture [H, W, 3] against the reference."""
         error = image_metrics.flip_map(self.reference.picture, picture)
-        return tuple(self._score(alpha, mask, picture, error) for alpha, mask in self.masks.items())
+        scores = tuple(self._score(alpha, mask, picture, error) for alpha, mask in self.masks.items())
+        return Shot(picture, error, scores)
 
     def _score(self, alpha: float | None, mask: Bools, picture: Float32, error: Float32) -> ImageScore:
         whole = alpha is None
@@ -152,7 +163,7 @@ class Studio:
             psnr_of_halves=masked_psnr(*halves, view.white, whole),
             flip_of_halves=float(image_metrics.flip(*halves)),
             rms_noise=view.reference.rms_noise,
-            stored=view.scores(self.shaded_from_store(view)) if stored else (),
+            stored=view.judge(self.shaded_from_store(view)).scores if stored else (),
         )
 
     def _view(self, name: str, camera: Camera) -> View:

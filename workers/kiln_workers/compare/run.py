@@ -12,14 +12,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-import numpy.typing as npt
-
 from kiln_schemas import __version__
 from kiln_schemas.errors import FitFailed
 from kiln_workers.compare import page
 from kiln_workers.compare.cache import Cache
-from kiln_workers.compare.pictures import PictureSettings, Studio
+from kiln_workers.compare.pictures import PictureSettings, Shot, Studio
 from kiln_workers.compare.progress import Display
 from kiln_workers.compare.resolutions import Rendered, converge, render_resolution
 from kiln_workers.compare.result import NAME_CSV, NAME_HTML, NAME_JSON, Comparison, Convergence, ImageScore, as_csv
@@ -33,8 +30,6 @@ from kiln_workers.fit.solution import Solver
 from kiln_workers.package.files import write_bytes
 from kiln_workers.shade.camera import Camera
 from kiln_workers.shade.image_files import write_picture
-
-Float32 = npt.NDArray[np.float32]
 
 MEMORY_SHARE: Final = 0.5
 """Of the memory, what light fields may take; the rest is for the solvers and for wavefronts."""
@@ -85,8 +80,8 @@ class _Found:
     starts: list[Convergence] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     studio: Studio | None = None
-    pictures: dict[tuple[str, int, str], Float32] = field(default_factory=dict)
-    """Shaded picture by solver, lobes and camera."""
+    shots: dict[tuple[str, int, str], Shot] = field(default_factory=dict)
+    """Shaded pictures by solver, lobes and camera."""
 
     def result(self, *, complete: bool) -> Comparison:
         subject, field_ = self.subject, self.chosen.field
@@ -126,7 +121,7 @@ class _Found:
         write_bytes(out / NAME_CSV, as_csv(result.rows).encode())
         views = () if self.studio is None else tuple(self.studio.views)
         texel = page.Texel(self.chosen.field, self.bench.shown)
-        shown = page.PageInput(result, texel, tuple(self.solved), views, self.pictures)
+        shown = page.PageInput(result, texel, tuple(self.solved), views, self.shots)
         write_bytes(out / NAME_HTML, page.render(shown))
         write_bytes(out / NAME_JSON, (result.model_dump_json(indent=2) + "\n").encode())
         return result
@@ -229,11 +224,11 @@ def _shade(found: _Found, studio: Studio, solved: Solved, display: Display) -> S
     scores: list[ImageScore] = []
     for view in studio.views:
         display.tell(f"{row.solver}, {row.lobes} lobes: camera {view.name}")
-        picture = studio.shaded(view, solved.lobes)
-        found.pictures[row.solver, row.lobes, view.name] = picture
-        scores += view.scores(picture)
+        shot = view.judge(studio.shaded(view, solved.lobes))
+        found.shots[row.solver, row.lobes, view.name] = shot
+        scores += shot.scores
         name = f"{view.name}-{row.solver}-{row.lobes}.png"
-        write_picture(found.plan.out / "pictures" / name, picture, view.white)
+        write_picture(found.plan.out / "pictures" / name, shot.picture, view.white)
     return replace(solved, row=row.model_copy(update={"images": tuple(scores)}))
 
 

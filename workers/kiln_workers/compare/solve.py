@@ -9,6 +9,7 @@ import numpy.typing as npt
 import torch
 
 from kiln_schemas import __version__
+from kiln_schemas.conventions import LOBE_PARAMETERS
 from kiln_workers.compare.cache import Cache, source_digest
 from kiln_workers.compare.convergence import Recorder, epochs_to_tolerance
 from kiln_workers.compare.result import Folds, Row
@@ -89,7 +90,7 @@ def solve(bench: Bench, solver: str, function: Solver, lobes: int) -> Solved:
         solver=solver,
         lobes=made.parameters.shape[1] if isinstance(made, Lobes) else lobes,
         texels=len(field),
-        floats_per_texel=made.floats_per_texel,
+        floats_per_texel=_floats_per_texel(made),
         epochs=solution.epochs,
         epochs_to_5_percent=epochs_to_tolerance(curve),
         seconds=solution.seconds,
@@ -107,6 +108,14 @@ def solve(bench: Bench, solver: str, function: Solver, lobes: int) -> Solved:
     arrays = {"shown": solved.shown} | ({} if solved.lobes is None else {"lobes": solved.lobes})
     bench.cache.save(KIND, bench.key(solver, function, lobes), row.model_dump(mode="json"), arrays)
     return solved
+
+
+def _floats_per_texel(made: Representation) -> int:
+    """Numbers that a texel has to hold: axes and sharpness that are the same for all texels need no room."""
+    if not isinstance(made, Lobes):
+        return made.floats_per_texel
+    common = bool((made.parameters[..., :4] == made.parameters[:1, :, :4]).all())
+    return made.parameters.shape[1] * (LOBE_PARAMETERS - 4 if common else LOBE_PARAMETERS)
 
 
 def _folds(lobes: Lobes, field: TexelField) -> Folds | None:
