@@ -127,7 +127,9 @@ def test_the_environment_of_the_shell_names_the_coordinator(lightkiln, coordinat
     assert ran.code == 0 and "jobs" in ran.document
 
 
-@pytest.mark.parametrize("command", [["status", "JOB"], ["watch", "JOB"], ["cancel", "JOB"]])
+@pytest.mark.parametrize(
+    "command", [["status", "JOB"], ["watch", "JOB"], ["cancel", "JOB"], ["compare", 32 * "f", "--out", "x"]]
+)
 def test_an_unknown_job(lightkiln, coordinator, command: list[str]) -> None:
     ran = lightkiln(*command, "--url", coordinator.url, "--data", coordinator.data, "--json")
     assert ran.code == 3 and ran.document["code"] == "not-found"

@@ -1,4 +1,4 @@
-"""`python -m kiln_workers worker|doctor|examples|shade|reference`: commands without the coordinator's code.
+"""`python -m kiln_workers worker|doctor|examples|shade|reference|compare`: commands without the coordinator's code.
 
 The package's `lightkiln` command runs these as subprocesses; a farm node that has only `lightkiln[worker]` installed
 can run them directly. Exit codes are those of `kiln_schemas.errors`, and 2 for wrong usage.
@@ -20,6 +20,7 @@ from typing import Any
 
 from kiln_schemas.errors import AuthError, InputError, InternalError, KilnError, MachineLacks
 from kiln_schemas.tasks import TaskKind
+from kiln_workers.compare.arguments import add_compare
 from kiln_workers.runner.machine import claim_folder, cores, default_memory_bytes, parse_size
 from kiln_workers.shade.arguments import add_commands
 
@@ -63,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     write.add_argument("--json", action="store_true", help="a JSON object with the files' paths")
     write.set_defaults(command=_examples)
     add_commands(commands)
+    add_compare(commands)
     return parser
 
 

@@ -104,6 +104,14 @@ class Api:
     def download(self, job_id: str, artifact: Artifact, target: Path, on_bytes: OnBytes) -> None:
         """Write an artifact to `target`; whole and with the right hash, or the next try."""
         path = f"/v1/jobs/{quote(job_id, safe='')}/artifacts/{quote(artifact.name)}"
+        self._save(path, artifact.sha256, artifact.name, target, on_bytes)
+
+    def get_blob(self, sha256: str, target: Path) -> None:
+        """Write a blob to `target`; whole and with the right hash, or the next try."""
+        self._save(f"/v1/blobs/{sha256}", sha256, "the blob", target, lambda _: None)
+
+    def _save(self, path: str, sha256: str, name: str, target: Path, on_bytes: OnBytes) -> None:
+        """Stream what lies at `path` into a file."""
 
         def attempt() -> httpx.Response:
             digest = hashlib.sha256()
@@ -115,8 +123,8 @@ class Api:
                     digest.update(chunk)
                     file.write(chunk)
                     on_bytes(len(chunk))
-            if digest.hexdigest() != artifact.sha256:
-                raise httpx.ReadError(f"{artifact.name} arrived damaged")
+            if digest.hexdigest() != sha256:
+                raise httpx.ReadError(f"{name} arrived damaged")
             return response
 
         self._patiently(attempt)

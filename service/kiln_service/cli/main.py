@@ -27,6 +27,7 @@ from kiln_service.cli import bake as baking
 from kiln_service.cli import options
 from kiln_service.cli.become import become
 from kiln_service.cli.bundle import collect
+from kiln_service.cli.compare import add_compare_command
 from kiln_service.cli.doctor import examine
 from kiln_service.cli.fetch import download_package
 from kiln_service.cli.gates import end_of, raise_if_missed, raise_unless_completed, write_junit
@@ -343,6 +344,7 @@ def examples_write(
 
 
 add_picture_commands(app)
+add_compare_command(app)
 
 
 def main() -> NoReturn:

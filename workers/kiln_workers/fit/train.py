@@ -88,10 +88,12 @@ def train(
     checkpoint_every_s: float = 60.0,
     exposure: float | None = None,
     on_epoch: Callable[[int, Weights], None] | None = None,
+    start: Weights | None = None,
 ) -> FitOutcome:
     """Fit one function; FitFailed where it does not clearly beat P = 0, InputError where there are no texels.
 
-    `exposure` is that of the source unless given; `on_epoch` is shown the weights after each pass over the texels.
+    `exposure` is that of the source unless given; `on_epoch` is shown the weights after each pass over the texels;
+    `start` is a network of the same shape to go on from, instead of random weights.
     """
     began = time.monotonic()
     if not sum(source.counts):
@@ -113,7 +115,7 @@ def train(
     else:
         if exposure is None:
             exposure = exposure_of(source, function)
-        state = _State(0, Adam.start(initial_parameters(shape, seed)), exposure)
+        state = _State(0, Adam.start(_first(shape, seed, start)), exposure)
     began -= state.seconds
     with single_threaded_pool(threads) as pool:
         if checkpoint is None and _errors(source, None, state.exposure, pool).log_mse_zero < NO_SIGNAL:
@@ -189,6 +191,15 @@ class _Trainer:
 
 def _weights(shape: Shape, state: _State) -> Weights:
     return Weights(shape, state.exposure, True, state.adam.parameters.cpu().numpy().copy())
+
+
+def _first(shape: Shape, seed: int, start: Weights | None) -> Tensor:
+    """The parameters [P] before the first step."""
+    if start is None:
+        return initial_parameters(shape, seed)
+    if start.shape != shape:
+        raise InputError(f"the start's network is {start.shape}, this one {shape}", where="start")
+    return torch.from_numpy(start.parameters.copy())
 
 
 def _errors(source: TexelSource, weights: Weights | None, exposure: float, pool: ThreadPoolExecutor) -> TexelErrors:

@@ -24,8 +24,12 @@ def cnn(
     settings: FitSettings = SETTINGS,
     function: Function = Function.LIGHT_FIELD,
     seed: int = 0,
+    start: Weights | None = None,
 ) -> Solution:
-    """Trained on the field alone, for `settings.steps`; FitFailed where it does not clearly beat P = 0."""
+    """Trained on the field alone, for `settings.steps`, from `start` or from random weights.
+
+    FitFailed where it does not clearly beat P = 0.
+    """
     watch = Stopwatch(on_epoch)
     threads = torch.get_num_threads()
     asked = settings.model_copy(update={"lobes": lobes})
@@ -34,7 +38,9 @@ def cnn(
     def listen(epoch: int, weights: Weights) -> None:
         watch.tell(epoch, lambda: _represent(field, weights, threads))
 
-    outcome = train(source, asked, function, seed, threads=threads, exposure=field.exposure, on_epoch=listen)
+    outcome = train(
+        source, asked, function, seed, threads=threads, exposure=field.exposure, on_epoch=listen, start=start
+    )
     solved = _represent(field, Weights.from_bytes(outcome.weights), threads)
     return Solution(solved, -(-outcome.steps * asked.batch // len(field)), watch.seconds)
 

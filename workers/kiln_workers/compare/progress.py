@@ -1,0 +1,102 @@
+"""Progress of a comparison on the terminal: what is being done, how much is left, and about how long that takes.
+
+Work is measured in lobes times texels. How fast a solver gets through it is known once it has run with another number
+of lobes; until then the mean of the others stands in, and the estimate says that it is a guess.
+"""
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+
+@dataclass
+class Estimate:
+    """Seconds that are left of a list of (solver, work)."""
+
+    left: list[tuple[str, float]]
+    rates: dict[str, list[float]] = field(default_factory=dict)
+    """Seconds per unit of work, as measured."""
+
+    def finished(self, solver: str, work: float, seconds: float | None) -> None:
+        """Take an item off the list; `seconds` is None where it was there already."""
+        self.left.remove((solver, work))
+        if seconds is not None:
+            self.rates.setdefault(solver, []).append(seconds / work)
+
+    def seconds(self) -> tuple[float, bool] | None:
+        """Seconds left, and whether the rates of all solvers are known; None before anything was measured."""
+        if not self.rates:
+            return None
+        rate = {name: sum(values) / len(values) for name, values in self.rates.items()}
+        usual = sum(rate.values()) / len(rate)
+        total = sum(work * rate.get(solver, usual) for solver, work in self.left)
+        return total, all(solver in rate for solver, _ in self.left)
+
+
+class Display:
+    """A bar on a terminal; a line for each item elsewhere, on standard error."""
+
+    def __init__(self, items: Sequence[tuple[str, float]], *, quiet: bool) -> None:
+        self._estimate = Estimate(list(items))
+        self._total = sum(work for _, work in items)
+        self._console = Console(stderr=True, quiet=quiet)
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[left]}"),
+            console=self._console,
+            disable=quiet or not sys.stderr.isatty(),
+        )
+        self._task: TaskID | None = None
+        self._began = 0.0
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        self._task = self._bar.add_task("starting", total=self._total, left="")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def say(self, message: str) -> None:
+        """What is being done; without a terminal a line of its own."""
+        self._update(message, 0.0)
+        if self._bar.disable:
+            self._console.print(message, markup=False, highlight=False)
+
+    def begin(self, solver: str, message: str) -> None:
+        """An item begins."""
+        self._began = time.monotonic()
+        self.say(f"{message}{self._left()}" if self._bar.disable else message)
+
+    def finish(self, solver: str, work: float, *, fresh: bool) -> None:
+        """An item is done; `fresh`: it was computed and not found."""
+        self._estimate.finished(solver, work, time.monotonic() - self._began if fresh else None)
+        self._update(None, work)
+
+    def tell(self, message: str) -> None:
+        """A detail of the present item, shown on a terminal only."""
+        self._update(message, 0.0)
+
+    def _update(self, message: str | None, advance: float) -> None:
+        if self._task is not None:
+            fields = {} if message is None else {"description": message}
+            self._bar.update(self._task, advance=advance, left=self._left().lstrip(", "), **fields)  # type: ignore[arg-type]
+
+    def _left(self) -> str:
+        estimate = self._estimate.seconds()
+        if estimate is None or not self._estimate.left:
+            return ""
+        minutes, seconds = divmod(round(estimate[0]), 60)
+        guess = "" if estimate[1] else ", a guess: not every solver has run yet"
+        return f", about {minutes}:{seconds:02d} left{guess}"

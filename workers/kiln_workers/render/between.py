@@ -1,0 +1,145 @@
+"""Light fields traced afresh half-way between texels: the targets of `log_mse_between`.
+
+The light-map UV of every mesh is moved by half a texel and rasterised again: the texel centres of the moved map are the
+between points of the first one, so their places on the surface are exact and need no interpolation of positions. A
+point counts only where the moved chart contains that centre, belongs to the mesh and chart of all its corners and was
+not pushed out of other geometry. Two halves with different random numbers are traced; none of them is that of a texel,
+so the targets' noise depends neither on the bake's nor on each other's.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from kiln_schemas.settings import RenderSettings
+from kiln_workers.fit.field import BetweenPoints, TexelField
+from kiln_workers.render.backend import Device
+from kiln_workers.render.tile import TexelBatch, TileRenderer, silent
+from kiln_workers.scene.model import Float32, Scene
+from kiln_workers.scene.push_out import push_out
+from kiln_workers.scene.raster import touched_squares
+from kiln_workers.scene.texel_map import TexelMap, TexelState
+from kiln_workers.scene.texels import rasterise_texels
+
+Float16 = npt.NDArray[np.float16]
+Bools = npt.NDArray[np.bool_]
+Index = npt.NDArray[np.int64]
+
+STEPS: Final = ((0, 1), (1, 0), (1, 1))
+"""The kinds of between points, in half texels (rows, columns), as in `fit.field.BetweenPoints.step`."""
+
+
+@dataclass(frozen=True)
+class PlacedPoints:
+    """B between points and where they lie on the surface."""
+
+    points: BetweenPoints
+    batch: TexelBatch
+    """Its `index` lies beyond that of every texel."""
+
+
+@dataclass(frozen=True)
+class TracedHalves:
+    """Two independent light fields of each of B points."""
+
+    halves: tuple[Float16, Float16]  # each [B, R, R, 3]
+    back_faces: Float32  # [B] fraction of primary rays that meet a back face
+    samples: int  # paths a pixel, both halves together
+
+
+def place_between(
+    scene: Scene, texel_map: TexelMap, field: TexelField, count: int, seed: int, device: Device = "auto"
+) -> PlacedPoints:
+    """Up to `count` points of each kind between the field's texels, drawn evenly at random from `seed`.
+
+    `texel_map` is the scene's at the field's resolution; only its meshes and charts are read.
+    """
+    chosen, batches = [], []
+    for kind, step in enumerate(STEPS):
+        moved, usable = _moved_map(scene, texel_map, step, device)
+        mine = np.flatnonzero((field.between.step == step).all(axis=1))
+        row, column = field.place[field.between.first[mine]].T
+        mine, row, column = (values[usable[row, column]] for values in (mine, row, column))
+        drawn = np.random.default_rng([seed, kind]).permutation(len(mine))[:count]
+        drawn.sort()
+        place = row[drawn], column[drawn]
+        chosen.append(mine[drawn])
+        texels = texel_map.state.size
+        batches.append(_batch(moved, place, (1 + kind) * texels))
+    joined = {name: np.concatenate([getattr(b, name) for b in batches]) for name in TexelBatch.__dataclass_fields__}
+    return PlacedPoints(field.between.take(np.concatenate(chosen)), TexelBatch(**joined))
+
+
+def trace_halves(
+    scene: Scene,
+    scene_hash: str,
+    settings: RenderSettings,
+    placed: PlacedPoints,
+    texels: int,
+    memory_bytes: int,
+    on_progress: Callable[[float], None] = silent,
+    device: Device = "auto",
+) -> TracedHalves:
+    """Trace both halves, each with half of `settings.samples` (at least 1), of a light map of `texels` = H W."""
+    each = max(1, settings.samples // 2)
+    renderer = TileRenderer(scene, scene_hash, settings.model_copy(update={"samples": each}), memory_bytes, device)
+    made = []
+    for half in range(2):
+        index = placed.batch.index + half * len(STEPS) * texels
+        batch = replace(placed.batch, index=index)
+
+        def report(done: float, half: int = half) -> None:
+            on_progress(0.5 * (half + done))
+
+        made.append(renderer.render_light_fields(batch, report))
+    back_faces = 0.5 * (made[0].back_faces + made[1].back_faces)
+    return TracedHalves((made[0].light_field, made[1].light_field), back_faces, 2 * each)
+
+
+def moved_scene(scene: Scene, step: tuple[int, int], shape: tuple[int, int]) -> Scene:
+    """The scene with light-map UVs moved so that the centre of texel (r, c) lies where (r, c) + step / 2 lay."""
+    offset = np.array([0.5 * step[1] / shape[1], 0.5 * step[0] / shape[0]])
+    meshes = []
+    for mesh in scene.meshes:
+        assert mesh.lightmap_uv is not None
+        meshes.append(replace(mesh, lightmap_uv=(mesh.lightmap_uv - offset).astype(np.float32)))
+    return replace(scene, meshes=tuple(meshes))
+
+
+def _moved_map(scene: Scene, texel_map: TexelMap, step: tuple[int, int], device: Device) -> tuple[TexelMap, Bools]:
+    """The texel map of the moved scene, and which of its texels [H, W] are points that count."""
+    shape = (texel_map.state.shape[0], texel_map.state.shape[1])
+    moved_to = moved_scene(scene, step, shape)
+    rasterised = rasterise_texels(moved_to, shape[0])
+    pushed = push_out(moved_to, rasterised, device)
+    corners = np.concatenate([_uv(mesh.lightmap_uv)[mesh.faces] for mesh in moved_to.meshes])
+    touched = touched_squares(corners * [shape[1], shape[0]], shape[1], shape[0])
+    inside = np.zeros(texel_map.state.size, bool)
+    inside[touched.square[touched.distance == 0.0]] = True
+    usable = (
+        inside.reshape(shape)
+        & (rasterised.state == TexelState.VALID)
+        & (rasterised.mesh == texel_map.mesh)
+        & (rasterised.chart == texel_map.chart)
+        & (pushed.position == rasterised.position).all(axis=-1)
+    )
+    return pushed, usable
+
+
+def _uv(values: Float32 | None) -> npt.NDArray[np.float64]:
+    assert values is not None
+    return values.astype(np.float64)
+
+
+def _batch(texel_map: TexelMap, place: tuple[Index, Index], first: int) -> TexelBatch:
+    return TexelBatch(
+        index=first + place[0] * texel_map.state.shape[1] + place[1],
+        position=texel_map.position[place],
+        normal=texel_map.normal[place],
+        shading_normal=texel_map.shading_normal[place],
+        alpha=texel_map.alpha[place],
+        texel_size=texel_map.texel_size[place],
+    )
