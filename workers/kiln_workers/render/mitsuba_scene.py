@@ -1,10 +1,9 @@
 """The parsed scene as a Mitsuba scene: what the path tracer traces, and what a reference render shows.
 
-Materials become `principled` (Burley 2012) with specular 0.5, that is F0 = 0.04, whose GGX alpha is roughness^2 as in
-glTF; its diffuse lobe is Disney's, not glTF's Lambert. The back of a single-sided material reflects nothing: it is the
-inside of a solid. The environment's rows are doubled, because Mitsuba puts the first row at the pole and `scene.model`
-half a row below it; on the doubled grid both agree at every row. A double-sided emitter becomes two sheets back to
-back. Spot lights fall off linearly in the angle between their cones, which glTF leaves open.
+Materials become `kiln_gltf` (see `gltf_bsdf`), glTF's own surface. The back of a single-sided material reflects
+nothing: it is the inside of a solid. The environment's rows are doubled, because Mitsuba puts the first row at the pole
+and `scene.model` half a row below it; on the doubled grid both agree at every row. A double-sided emitter becomes two
+sheets back to back. Spot lights fall off linearly in the angle between their cones, which glTF leaves open.
 """
 
 from typing import Any, Final
@@ -14,6 +13,7 @@ import numpy as np
 from kiln_workers.render import textures
 from kiln_workers.render.backend import select_variant
 from kiln_workers.render.emitters import register_emitters
+from kiln_workers.render.gltf_bsdf import register_bsdfs
 from kiln_workers.render.jit import dr, mi
 from kiln_workers.scene.model import (
     Environment,
@@ -38,6 +38,7 @@ def to_mitsuba(scene: Scene) -> Any:
     if mi.variant() is None:
         select_variant()
     register_emitters()
+    register_bsdfs()
     powers = _EmitterPowers(scene)
     parts: dict[str, Any] = {"type": "scene"}
     bsdfs: dict[int, Any] = {}
@@ -176,7 +177,9 @@ def _mesh(mesh: Mesh, material: Material, bsdf: Any, emitter: Any | None) -> Any
 
 
 def _bsdf(scene: Scene, material: Material, uv: Float32 | None) -> dict[str, Any]:
-    surface: dict[str, Any] = {"type": "principled", "specular": 0.5, **_reflectance(scene, material, uv)}
+    # As objects: a plugin written in Python would get a nested colour as three numbers.
+    inputs = {name: mi.load_dict(texture) for name, texture in _reflectance(scene, material, uv).items()}
+    surface: dict[str, Any] = {"type": "kiln_gltf", **inputs}
     if material.double_sided:
         surface = {"type": "twosided", "bsdf": surface}
     if material.alpha_cutoff is None:
@@ -191,7 +194,8 @@ def _reflectance(scene: Scene, material: Material, uv: Float32 | None) -> dict[s
         pixels = textures.linear_pixels(scene.images[material.base_color_texture.image])[..., :3] * factor
         out["base_color"] = textures.bitmap(np.clip(pixels, 0.0, 1.0), material.base_color_texture, uv)
     roughness = float(np.clip(material.roughness, MIN_ROUGHNESS, 1.0))
-    out |= {"roughness": roughness, "metallic": float(np.clip(material.metallic, 0.0, 1.0))}
+    out["roughness"] = {"type": "uniform", "value": roughness}
+    out["metallic"] = {"type": "uniform", "value": float(np.clip(material.metallic, 0.0, 1.0))}
     if material.metallic_roughness_texture is not None and uv is not None:
         reference = material.metallic_roughness_texture
         pixels = textures.linear_pixels(scene.images[reference.image])
