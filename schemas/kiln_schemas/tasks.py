@@ -119,7 +119,9 @@ class PackagePayload(Contract):
     cameras: Cameras = Field(default_factory=dict)
 
 
-Payload = Annotated[PreparePayload | RenderPayload | FitPayload | RefinePayload | PackagePayload, Field(discriminator="kind")]
+Payload = Annotated[
+    PreparePayload | RenderPayload | FitPayload | RefinePayload | PackagePayload, Field(discriminator="kind")
+]
 
 
 class PrepareResult(Contract):

@@ -19,7 +19,7 @@ from kiln_service.cli import options
 from kiln_service.cli.api import Api
 from kiln_service.cli.become import become
 from kiln_service.cli.fetch import download_package, writing
-from kiln_service.cli.progress import raise_unless_completed
+from kiln_service.cli.gates import raise_unless_completed
 
 JOB_ID: Final = re.compile(r"[0-9a-f]{32}")
 PACKAGE: Final = "package"

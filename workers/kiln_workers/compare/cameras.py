@@ -3,8 +3,8 @@
 import json
 from pathlib import Path
 
+from kiln_schemas.camera import REMEDY, Camera, read_camera
 from kiln_schemas.errors import InputError
-from kiln_workers.shade.camera import REMEDY, Camera, read_camera
 
 
 def read_cameras(names: list[str]) -> dict[str, Camera]:

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from kiln_schemas.camera import Camera
 from kiln_workers.compare.cache import Cache
 from kiln_workers.compare.result import Camera as CameraView
 from kiln_workers.compare.result import ImageScore
@@ -23,7 +24,6 @@ from kiln_workers.package import colour
 from kiln_workers.package.dilate import plan_fill
 from kiln_workers.package.half import as_stored
 from kiln_workers.shade import image_metrics
-from kiln_workers.shade.camera import Camera
 from kiln_workers.shade.gbuffer import GBuffer, render_gbuffer
 from kiln_workers.shade.package import Incident, LobeTextures, ShadePackage
 from kiln_workers.shade.picture import shade

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from kiln_schemas import __version__
+from kiln_schemas.camera import Camera
 from kiln_schemas.errors import FitFailed
 from kiln_workers.compare import page
 from kiln_workers.compare.cache import Cache
@@ -28,7 +29,6 @@ from kiln_workers.compare.texels import ChosenTexels, choose_texels
 from kiln_workers.compare.warm import warm_start
 from kiln_workers.fit.solution import Solver
 from kiln_workers.package.files import write_bytes
-from kiln_workers.shade.camera import Camera
 from kiln_workers.shade.image_files import write_picture
 
 MEMORY_SHARE: Final = 0.5

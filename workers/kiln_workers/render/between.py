@@ -1,10 +1,13 @@
-"""Light fields traced afresh half-way between texels: the targets of `log_mse_between`.
+"""Points half-way between texels: where the coherent fit learns, and the targets of `log_mse_between`.
 
 The light-map UV of every mesh is moved by half a texel and rasterised again: the texel centres of the moved map are the
 between points of the first one, so their places on the surface are exact and need no interpolation of positions. A
 point counts only where the moved chart contains that centre, belongs to the mesh and chart of all its corners and was
-not pushed out of other geometry. Two halves with different random numbers are traced; none of them is that of a texel,
-so the targets' noise depends neither on the bake's nor on each other's.
+not pushed out of other geometry.
+
+What a bake traces for the fit is sparse, one pixel of each 2 x 2 block (`sparse_offsets`). The targets that measure
+the error are traced afresh and whole, in two halves. All of these, and the texels' own images, have different random
+numbers.
 """
 
 from collections.abc import Callable
@@ -17,19 +20,50 @@ import numpy.typing as npt
 from kiln_schemas.settings import RenderSettings
 from kiln_workers.fit.field import BetweenPoints, TexelField
 from kiln_workers.render.backend import Device
-from kiln_workers.render.tile import TexelBatch, TileRenderer, silent
+from kiln_workers.render.tile import Progress, TexelBatch, TileRenderer, silent
 from kiln_workers.scene.model import Float32, Scene
 from kiln_workers.scene.push_out import push_out
 from kiln_workers.scene.raster import touched_squares
 from kiln_workers.scene.texel_map import TexelMap, TexelState
 from kiln_workers.scene.texels import rasterise_texels
+from kiln_workers.store.layout import BETWEEN_STEPS, sparse_offsets
 
 Float16 = npt.NDArray[np.float16]
 Bools = npt.NDArray[np.bool_]
 Index = npt.NDArray[np.int64]
 
-STEPS: Final = ((0, 1), (1, 0), (1, 1))
-"""The kinds of between points, in half texels (rows, columns), as in `fit.field.BetweenPoints.step`."""
+SPARSE_SEQUENCE: Final = 7
+"""The sparse images' random numbers begin after those of the texels and of both halves of three kinds of targets."""
+
+
+def between_maps(scene: Scene, texel_map: TexelMap, device: Device = "auto") -> tuple[TexelMap, ...]:
+    """One texel map for each of BETWEEN_STEPS: a texel that is VALID there stands for the point a step from its own."""
+    made = []
+    for step in BETWEEN_STEPS:
+        moved, usable = _moved_map(scene, texel_map, step, device)
+        made.append(replace(moved, state=np.where(usable, TexelState.VALID, TexelState.GUTTER).astype(np.uint8)))
+    return tuple(made)
+
+
+def trace_sparse(
+    renderer: TileRenderer,
+    moved: TexelMap,
+    place: tuple[Index, Index],
+    kind: int,
+    samples: int,
+    on_progress: Progress = silent,
+) -> tuple[Float16, int]:
+    """Sparse light fields [B, R / 2, R / 2, 3] of the points `place` of one of `between_maps`, and the paths traced."""
+    offsets = sparse_offsets(*place, kind)
+    batch = _batch(moved, place, (SPARSE_SEQUENCE + kind) * moved.state.size)
+    traced = renderer.render_light_fields(batch, on_progress, samples=samples, offsets=offsets)
+    images = traced.light_field
+    half = images.shape[1] // 2
+    out = np.empty((len(images), half, half, 3), np.float16)
+    for offset in np.unique(offsets, axis=0):
+        at = (offsets == offset).all(axis=1)
+        out[at] = images[at, offset[0] :: 2, offset[1] :: 2]
+    return out, traced.paths
 
 
 @dataclass(frozen=True)
@@ -58,7 +92,7 @@ def place_between(
     `texel_map` is the scene's at the field's resolution; only its meshes and charts are read.
     """
     chosen, batches = [], []
-    for kind, step in enumerate(STEPS):
+    for kind, step in enumerate(BETWEEN_STEPS):
         moved, usable = _moved_map(scene, texel_map, step, device)
         mine = np.flatnonzero((field.between.step == step).all(axis=1))
         row, column = field.place[field.between.first[mine]].T
@@ -88,7 +122,7 @@ def trace_halves(
     renderer = TileRenderer(scene, scene_hash, settings.model_copy(update={"samples": each}), memory_bytes, device)
     made = []
     for half in range(2):
-        index = placed.batch.index + half * len(STEPS) * texels
+        index = placed.batch.index + half * len(BETWEEN_STEPS) * texels
         batch = replace(placed.batch, index=index)
 
         def report(done: float, half: int = half) -> None:

@@ -104,13 +104,24 @@ class TileRenderer:
             overflows=fields.overflows + dropped,
         )
 
-    def render_light_fields(self, texels: TexelBatch, on_progress: Progress = silent) -> TileImages:
-        """The light-field images and back faces alone; no visibility, irradiance zero."""
-        size, samples = self.settings.image_size, self.settings.samples
+    def render_light_fields(
+        self,
+        texels: TexelBatch,
+        on_progress: Progress = silent,
+        *,
+        samples: int | None = None,
+        offsets: Int64 | None = None,
+    ) -> TileImages:
+        """The light-field images and back faces alone; no visibility, irradiance zero.
+
+        `samples` paths a pixel instead of the settings'. With `offsets` [T, 2] only one pixel of each 2 x 2 block is
+        traced, that row and column of the block.
+        """
+        size, samples = self.settings.image_size, samples or self.settings.samples
         out = np.zeros((len(texels), size * size, 3), np.float16)
         back, paths = np.zeros(len(texels), np.int64), np.zeros(len(texels), np.int64)
         overflows = 0
-        for part, fraction in self._pixel_wavefronts(texels):
+        for part, fraction in self._pixel_wavefronts(texels, offsets):
             texel, pixel = part[:, 0], part[:, 1]
             sums = self._trace_pixels(texels, texel, pixel, samples)
             mean = np.array(sums.radiance).T / np.maximum(np.array(sums.weight), 1e-30)[:, None]
@@ -210,8 +221,8 @@ class TileRenderer:
             on_progress(min(first + group, len(texels)) / len(texels))
         return out.reshape(len(texels), size, size, 3)
 
-    def _pixel_wavefronts(self, texels: TexelBatch) -> Iterator[tuple[Int64, float]]:
-        """Wavefronts (texel, pixel) [L, 2] of all pixels above the horizon, and the fraction done after each."""
+    def _pixel_wavefronts(self, texels: TexelBatch, offsets: Int64 | None) -> Iterator[tuple[Int64, float]]:
+        """Wavefronts (texel, pixel) [L, 2] of the pixels above the horizon, and the fraction done after each."""
         size = self.settings.image_size
         # About half of the pixels are above, so this many texels fill a wavefront.
         group = max(1, 2 * self.wavefront // (size * size))
@@ -219,6 +230,9 @@ class TileRenderer:
             normals = texels.normal[first : first + group]
             lanes = lanes_above_horizon(normals, size)
             lanes[:, 0] += first
+            if offsets is not None:
+                inside = np.stack(np.divmod(lanes[:, 1], size), axis=1) % 2
+                lanes = lanes[(inside == offsets[lanes[:, 0]]).all(axis=1)]
             for part, fraction in self._wavefronts(lanes):
                 yield part, (first + fraction * len(normals)) / len(texels)
 

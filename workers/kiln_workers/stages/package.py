@@ -2,7 +2,7 @@
 
 import platform
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Final
@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kiln_schemas import __version__
+from kiln_schemas.errors import InternalError
 from kiln_schemas.settings import Function, PackageSettings
-from kiln_schemas.tasks import FitMetrics, FitResult, PackagePayload, PackageResult, Tile
+from kiln_schemas.tasks import FitMetrics, FitResult, PackagePayload, PackageResult, RefineResult, Tile
 from kiln_workers.fit.metrics import TexelErrors, texel_errors
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.source import valid_texels
@@ -28,6 +29,7 @@ from kiln_workers.scene.texel_map import TexelMap, unpack_texel_map
 from kiln_workers.sphere.gaussian import evaluate
 from kiln_workers.sphere.octahedral import pixel_directions
 from kiln_workers.stages.gates import GateJudge
+from kiln_workers.stages.refine import read_lobes
 from kiln_workers.stages.tiles import map_coordinates, with_render_verdict
 from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
 from kiln_workers.store.light_field import LightFieldStore
@@ -61,7 +63,8 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
     previews: dict[Function, FunctionPreview] = {}
     for number, fit in enumerate(payload.fits):
         context.progress(number, steps, "steps", f"evaluating the {fit.function.value}")
-        judged = _judge(fit, _Texels(store, texel_map, tiles, fit.function), context)
+        texels = _Texels(store, texel_map, tiles, fit.function)
+        judged = _judge(fit, payload.refines if fit.function is Function.LIGHT_FIELD else (), texels, context)
         lobes[fit.function], metrics[fit.function], previews[fit.function] = judged
 
     context.progress(steps - 2, steps, "steps", "convolving the environment")
@@ -117,16 +120,23 @@ class _Texels:
         return np.asarray(self.store.read_tile(self.function, tile, inside)[0])
 
 
-def _judge(fit: FitResult, texels: _Texels, context: Context) -> tuple[LobeMap, FitMetrics, FunctionPreview]:
-    """Lobes of every valid texel as the texture will hold them, their errors, and the texels to show."""
+def _judge(
+    fit: FitResult, refines: Sequence[RefineResult], texels: _Texels, context: Context
+) -> tuple[LobeMap, FitMetrics, FunctionPreview]:
+    """Lobes of every valid texel as the texture will hold them, their errors, and the texels to show.
+
+    The lobes are those of the refined blocks, or the network's output where there are none.
+    """
     weights = Weights.from_bytes(context.blob(fit.weights))
     shape = texels.map.state.shape
     lobes = np.zeros((*shape, weights.shape.lobes, 7), np.float32)
     mask = np.zeros(shape, bool)
     per_texel = np.full(shape, np.nan, np.float32)
+    refined = _refined(refines, lobes, context) if refines else None
     parts = []
     for place, images, normals in texels.batches():
-        stored = as_stored(predict(weights, images, normals, threads=context.threads))
+        found = predict(weights, images, normals, threads=context.threads) if refined is None else refined[place]
+        stored = as_stored(found)
         errors = texel_errors(stored, images, normals, weights.exposure)
         lobes[place], mask[place] = stored, True
         per_texel[place] = errors.error / errors.weight
@@ -141,6 +151,17 @@ def _judge(fit: FitResult, texels: _Texels, context: Context) -> tuple[LobeMap, 
     )
     best, median, worst = (_preview(texels, lobes, per_texel, at) for at in choose_texels(per_texel))
     return LobeMap(lobes, mask), metrics, FunctionPreview(best, median, worst, per_texel)
+
+
+def _refined(refines: Sequence[RefineResult], like: Float32, context: Context) -> Float32:
+    """The refined lobes of all blocks in one map [H, W, N, 7]; InternalError where a block is not whole."""
+    out = np.zeros_like(like)
+    for refine in refines:
+        place, lobes = read_lobes(context.blob(refine.lobes))
+        if len(lobes) != refine.texels:
+            raise InternalError(f"block {refine.block.row},{refine.block.column} has {len(lobes)} texels")
+        out[place] = lobes
+    return out
 
 
 def _preview(texels: _Texels, lobes: Float32, errors: Float32, at: tuple[int, int]) -> TexelPreview:
@@ -177,7 +198,8 @@ def _stage_seconds(payload: PackagePayload, package: float) -> Mapping[str, floa
     """Busy seconds of each stage, added up over its tasks; `package` up to the writing of the manifest."""
     fits = {f"fit {fit.function.value}": fit.seconds for fit in payload.fits}
     render = sum(result.seconds for result in payload.renders)
-    return {"prepare": payload.prepare.seconds, "render": render, **fits, "package": package}
+    refine = {"refine": sum(result.seconds for result in payload.refines)} if payload.refines else {}
+    return {"prepare": payload.prepare.seconds, "render": render, **fits, **refine, "package": package}
 
 
 def _versions() -> Mapping[str, str]:

@@ -6,8 +6,9 @@ from typing import Final
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.job import check_bundle
-from kiln_schemas.settings import BakeSettings, Function
+from kiln_schemas.settings import BakeSettings, Function, Solver
 from kiln_schemas.tasks import Bundle, PreparePayload, PrepareResult
+from kiln_workers.render.between import between_maps
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import pack_scene, scene_hash
 from kiln_workers.scene.atlas import assign_lightmap_uv
@@ -19,7 +20,14 @@ from kiln_workers.stages.tiles import plan_tiles
 from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
 from kiln_workers.store.light_field import LightFieldStore
 
-STEPS: Final = ("fetching the scene", "reading the scene", "laying out the light map", "placing the texels", "saving")
+STEPS: Final = (
+    "fetching the scene",
+    "reading the scene",
+    "laying out the light map",
+    "placing the texels",
+    "placing the points between",
+    "saving",
+)
 
 
 def run(payload: PreparePayload, context: Context) -> PrepareResult:
@@ -46,12 +54,15 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
             remedy="Check the size of its light-map charts.",
         )
     step(4)
+    between = between_maps(scene, texel_map) if traces_between(settings) else ()
+    step(5)
     digest = scene_hash(scene, settings.render)
     _create_store(payload.store_url, scene, texel_map, digest, settings)
     context.log(f"{scene.triangles} triangles, {texel_map.covered} texels in {len(tiles)} tiles")
     return PrepareResult(
         scene=context.put_blob(pack_scene(scene)),
         texel_map=context.put_blob(pack_texel_map(texel_map)),
+        between=tuple(context.put_blob(pack_texel_map(moved)) for moved in between),
         scene_hash=digest,
         tiles=tiles,
         has_environment=scene.environment is not None,
@@ -60,6 +71,11 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         notes=scene.notes,
         seconds=time.perf_counter() - began,
     )
+
+
+def traces_between(settings: BakeSettings) -> bool:
+    """Whether the fit learns from light fields between texels."""
+    return settings.fit.solver is Solver.COHERENT and settings.render.between_samples > 0
 
 
 def _lay_out(bundle: Bundle, context: Context) -> Path:
@@ -79,6 +95,7 @@ def _create_store(url: str, scene: Scene, texel_map: TexelMap, digest: str, sett
         image_size=settings.render.image_size,
         tile=settings.lightmap.tile,
         functions=[Function.LIGHT_FIELD] + ([Function.VISIBILITY] if scene.environment else []),
+        between=traces_between(settings),
         attributes={"scene_hash": digest, "settings": settings.model_dump(mode="json")},
     )
     store.write_texel_map({name: getattr(texel_map, name) for name in TEXEL_MAP_ARRAYS})

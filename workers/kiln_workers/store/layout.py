@@ -8,12 +8,18 @@ Format: Zarr v3 core, sharding_indexed (ZEP 2), crc32c on the shard's index and 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
+
 from kiln_schemas import conventions
 from kiln_schemas.settings import Function
 
-_BYTES: Final = {"name": "bytes", "configuration": {"endian": "little"}}
-_CRC: Final = {"name": "crc32c"}
-_ZSTD: Final = {"name": "zstd", "configuration": {"level": 3, "checksum": False}}
+_BYTES: Final[dict[str, Any]] = {"name": "bytes", "configuration": {"endian": "little"}}
+_CRC: Final[dict[str, Any]] = {"name": "crc32c"}
+_ZSTD: Final[dict[str, Any]] = {"name": "zstd", "configuration": {"level": 3, "checksum": False}}
+
+BETWEEN_STEPS: Final = ((0, 1), (1, 0), (1, 1))
+"""From a texel to the between points that are kept with it, in half texels (rows, columns)."""
 
 TEXEL_MAP_ARRAYS: Final[Mapping[str, tuple[str, int]]] = {
     "state": ("uint8", 1),
@@ -47,6 +53,12 @@ CONVENTIONS: Final[Mapping[str, str]] = {
         "Illumination-weighted environment visibility W_E (Currius et al. 2020, eq. 7) of the GGX lobe of `alpha`, "
         "0 to 1 per colour channel."
     ),
+    "between": (
+        "Sparse light fields half-way between texels of a chart, indexed [row, column, kind, y, x, channel]: kind 0 "
+        "half a texel to the right of texel (row, column), 1 half a texel down, 2 both. Pixel (x, y) holds pixel "
+        "(2x + a, 2y + b) of a whole image, with 2b + a = (2 row + column + kind) mod 4. Points between texels of "
+        "different charts are zero."
+    ),
     "irradiance": "Over the hemisphere of the texel's shading normal, direct and indirect, environment included.",
     "exposure": (
         "Values here are not exposure-normalised. The fit multiplies radiance by EXPOSURE_KEY / (mean luminance above "
@@ -58,13 +70,23 @@ CONVENTIONS: Final[Mapping[str, str]] = {
 }
 
 
+def sparse_offsets(rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64], kind: int) -> npt.NDArray[np.int64]:
+    """Row and column [B, 2] in each 2 x 2 block of the pixel that `between` holds; it changes from point to point."""
+    return np.stack(np.divmod((2 * rows + columns + kind) % 4, 2), axis=1)
+
+
 def group_document(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """The group's zarr.json."""
     return {"zarr_format": 3, "node_type": "group", "attributes": dict(attributes)}
 
 
 def group_attributes(
-    shape: tuple[int, int], image_size: int, tile: int, functions: Sequence[Function], extra: Mapping[str, Any]
+    shape: tuple[int, int],
+    image_size: int,
+    tile: int,
+    functions: Sequence[Function],
+    between: bool,
+    extra: Mapping[str, Any],
 ) -> dict[str, Any]:
     """What the group says of itself: layout, conventions and what the caller adds (settings, scene hash, ...)."""
     return {
@@ -75,6 +97,7 @@ def group_attributes(
         "image_size": image_size,
         "tile": tile,
         "functions": [function.value for function in functions],
+        "between": between,
         "exposure_key": conventions.EXPOSURE_KEY,
         "conventions": dict(CONVENTIONS),
     }
@@ -84,16 +107,29 @@ def image_metadata(function: Function, shape: tuple[int, int], image_size: int, 
     """Array metadata of a light-field or visibility array [H, W, R, R, 3] float16."""
     image = [image_size, image_size, 3]
     inner = [_BYTES, _CRC] if function is Function.LIGHT_FIELD else [_BYTES, _ZSTD, _CRC]
-    codec = {
+    return _metadata(
+        "float16", [*shape, *image], [tile, tile, *image], [_sharded(image, inner)], ["row", "column", "y", "x", "rgb"]
+    )
+
+
+def _sharded(image: list[int], codecs: list[dict[str, Any]]) -> dict[str, Any]:
+    """The codec of an array whose shard is a tile and whose chunk is one texel's `image`."""
+    return {
         "name": "sharding_indexed",
         "configuration": {
             "chunk_shape": [1, 1, *image],
-            "codecs": inner,
+            "codecs": codecs,
             "index_codecs": [_BYTES, _CRC],
             "index_location": "end",
         },
     }
-    return _metadata("float16", [*shape, *image], [tile, tile, *image], [codec], ["row", "column", "y", "x", "rgb"])
+
+
+def between_metadata(shape: tuple[int, int], image_size: int, tile: int) -> dict[str, Any]:
+    """Array metadata of the sparse light fields between texels [H, W, 3, R / 2, R / 2, 3] float16."""
+    image = [len(BETWEEN_STEPS), image_size // 2, image_size // 2, 3]
+    names = ["row", "column", "kind", "y", "x", "rgb"]
+    return _metadata("float16", [*shape, *image], [tile, tile, *image], [_sharded(image, [_BYTES, _ZSTD, _CRC])], names)
 
 
 def irradiance_metadata(shape: tuple[int, int], tile: int) -> dict[str, Any]:

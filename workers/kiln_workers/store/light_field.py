@@ -37,6 +37,7 @@ class LightFieldStore:
         self.shape: Final[tuple[int, int]] = (attributes["resolution"][0], attributes["resolution"][1])
         self.image_size: Final = int(attributes["image_size"])
         self.tile_size: Final = int(attributes["tile"])
+        self.has_between: Final = bool(attributes.get("between", False))
         self.functions: Final = tuple(Function(name) for name in attributes["functions"])
         self._context = ts.Context({"data_copy_concurrency": {"limit": 2}, "file_io_concurrency": {"limit": 8}})
         self._arrays: dict[str, Any] = {}
@@ -51,13 +52,14 @@ class LightFieldStore:
         tile: int,
         functions: Sequence[Function],
         attributes: Mapping[str, Any],
+        between: bool = False,
     ) -> Self:
         """Make the store, or open it where an identical one lies there; Conflict where a different one does.
 
         `attributes` (settings, scene hash, ...) must be JSON. The group document is written last, so a
         store that opens is whole.
         """
-        mine = json.loads(json.dumps(layout.group_attributes(shape, image_size, tile, functions, attributes)))
+        mine = json.loads(json.dumps(layout.group_attributes(shape, image_size, tile, functions, between, attributes)))
         found = _read_group(url)
         if found is not None:
             _refuse_difference(url, found, mine)
@@ -123,26 +125,41 @@ class LightFieldStore:
             self._write_texels(function.value, tile, covered, values)
         self._write_texels(conventions.ARRAY_IRRADIANCE, tile, covered, irradiance.astype(np.float32, copy=False))
 
+    def write_between(self, tile: Tile, texels: Index, images: Float16) -> None:
+        """Replace a tile's sparse light fields between texels: row-major `texels` [B], images [B, 3, R/2, R/2, 3]."""
+        self._refuse_not_finite(images, conventions.ARRAY_BETWEEN)
+        self._write_texels(conventions.ARRAY_BETWEEN, tile, texels, images)
+
+    def read_between(self, tile: Tile, texels: Index) -> Float16:
+        """Sparse light fields [B, 3, R/2, R/2, 3] of the texels [B] (row-major inside the tile); NotFound without."""
+        if not self.has_between:
+            raise NotFound("the store holds no light fields between texels", where=self.url)
+        return self._read_texels(conventions.ARRAY_BETWEEN, tile, texels)
+
     def read_tile(self, function: Function, tile: Tile, covered: Index) -> Float16:
         """Images [T, R, R, 3] of the texels `covered` [T] (row-major inside the tile); NotFound without a shard."""
         if function not in self.functions:
             raise NotFound(f"the store has no {function.value}", where=self.url)
-        array = self._array(function.value)
-        key = f"c/{tile.row // self.tile_size}/{tile.column // self.tile_size}/0/0/0"
-        rows, columns = self._positions(tile, covered)
-        with translated_errors(self.url):
-            if not array.kvstore.list(ts.KvStore.KeyRange(key, key + "\0")).result():
-                raise NotFound(
-                    f"{function.value} has no tile at row {tile.row}, column {tile.column}",
-                    where=self.url,
-                    remedy="Render the tile again.",
-                )
-            return np.asarray(array[rows, columns].read().result())
+        return self._read_texels(function.value, tile, covered)
 
     def read_irradiance(self) -> Float32:
         """Irradiance [H, W, 3]; zero where nothing was written."""
         with translated_errors(self.url):
             return np.asarray(self._array(conventions.ARRAY_IRRADIANCE).read().result())
+
+    def _read_texels(self, name: str, tile: Tile, covered: Index) -> Float16:
+        array = self._array(name)
+        dimensions = "/0" * (array.rank - 2)
+        key = f"c/{tile.row // self.tile_size}/{tile.column // self.tile_size}{dimensions}"
+        rows, columns = self._positions(tile, covered)
+        with translated_errors(self.url):
+            if not array.kvstore.list(ts.KvStore.KeyRange(key, key + "\0")).result():
+                raise NotFound(
+                    f"{name} has no tile at row {tile.row}, column {tile.column}",
+                    where=self.url,
+                    remedy="Render the tile again.",
+                )
+            return np.asarray(array[rows, columns].read().result())
 
     def _write_texels(self, name: str, tile: Tile, covered: Index, values: npt.NDArray[Any]) -> None:
         rows, columns = self._positions(tile, covered)
@@ -162,6 +179,8 @@ class LightFieldStore:
 
     def _metadata(self) -> dict[str, dict[str, Any]]:
         out = {f.value: layout.image_metadata(f, self.shape, self.image_size, self.tile_size) for f in self.functions}
+        if self.has_between:
+            out[conventions.ARRAY_BETWEEN] = layout.between_metadata(self.shape, self.image_size, self.tile_size)
         out[conventions.ARRAY_IRRADIANCE] = layout.irradiance_metadata(self.shape, self.tile_size)
         return out | {name: layout.texel_map_metadata(name, self.shape) for name in layout.TEXEL_MAP_ARRAYS}
 

@@ -29,6 +29,7 @@ from torch import Tensor
 from kiln_workers.fit.field import BetweenTargets, TexelField
 from kiln_workers.fit.lobes import constrain
 from kiln_workers.fit.metrics import horizon_weights
+from kiln_workers.fit.network import pixel_centres
 from kiln_workers.fit.optimizer import BETA_1, BETA_2, one_cycle
 from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, mixed_lobes, nobody
 from kiln_workers.fit.solvers.alignment import Neighbourhood
@@ -182,15 +183,25 @@ class _Problem:
 
 
 def mean_targets(field: TexelField) -> BetweenTargets:
-    """What is taken for the light fields at all between points where none were traced: the mean of their corners'."""
-    between, half = field.between, field.image_size // 2
+    """What is taken for the light fields at all between points where none were traced: the mean of their corners'.
+
+    Of those corners whose horizon a pixel's centre is above: below it an image holds nothing.
+    """
+    between, size = field.between, field.image_size
+    half = size // 2
     images = np.empty((len(between), half, half, 3), np.float16)
     offsets = np.stack(np.divmod(np.arange(len(between)) % 4, 2), axis=1)
+    centres = pixel_centres(size).numpy().reshape(size, size, 3)
     for offset in np.unique(offsets, axis=0):
         at = np.flatnonzero((offsets == offset).all(axis=1))
+        directions = centres[offset[0] :: 2, offset[1] :: 2].reshape(-1, 3)
+        seen = (field.normals @ directions.T > 0.0).astype(np.float32).reshape(len(field), half, half, 1)
+        sparse = field.images[:, offset[0] :: 2, offset[1] :: 2]
         for part in np.array_split(at, max(1, len(at) // _POINTS)):
-            seen = field.images[:, offset[0] :: 2, offset[1] :: 2][between.corners[part]]
-            images[part] = seen.astype(np.float32).mean(axis=1).astype(np.float16)
+            corners = between.corners[part]
+            weight = seen[corners]
+            total = (sparse[corners].astype(np.float32) * weight).sum(axis=1)
+            images[part] = (total / np.maximum(weight.sum(axis=1), 1.0)).astype(np.float16)
     normals = field.normals[between.corners].mean(axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)
     return BetweenTargets(np.arange(len(between)), normals.astype(np.float32), offsets, images)

@@ -1,0 +1,152 @@
+"""Refine one block of the light field's lobes: from the network's to coherent ones (`fit.solvers.coherent`).
+
+A block is solved with `conventions.REFINE_HALO` texels of its neighbours around it, which are then dropped: the lobes
+of a texel near the edge are moved by what lies around it, as its neighbours' are in the block next to it. Memory is
+that of one block's images; a lost task is simply done again, and gives the same bytes.
+"""
+
+import time
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from kiln_schemas.conventions import FP16_MAX, LOBE_PARAMETERS, REFINE_HALO
+from kiln_schemas.settings import Function
+from kiln_schemas.tasks import Block, RefinePayload, RefineResult, Tile
+from kiln_workers.fit.field import BetweenTargets, TexelField
+from kiln_workers.fit.predict import Weights, predict
+from kiln_workers.fit.solvers.coherent import CoherentOptions, descend
+from kiln_workers.fit.source import valid_texels
+from kiln_workers.runner.context import Context
+from kiln_workers.scene.container import pack, unpack
+from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
+from kiln_workers.stages.tiles import map_coordinates, with_render_verdict
+from kiln_workers.store.layout import BETWEEN_STEPS, sparse_offsets
+from kiln_workers.store.light_field import LightFieldStore
+
+Float32 = npt.NDArray[np.float32]
+
+_KIND: Final = "lobes"
+
+
+def run(payload: RefinePayload, context: Context) -> RefineResult:
+    """The lobes of a block's valid texels; the same payload always gives the same bytes."""
+    began = time.perf_counter()
+    block, steps = payload.block, payload.settings.fit.refine_steps
+    texel_map = with_render_verdict(unpack_texel_map(context.blob(payload.texel_map)), payload.renders)
+    moved = tuple(unpack_texel_map(context.blob(digest)) for digest in payload.between)
+    weights = Weights.from_bytes(context.blob(payload.fit.weights))
+    store = LightFieldStore.open(payload.store_url)
+    field = _read_field(store, texel_map, moved, [r.tile for r in payload.renders], block, weights.exposure)
+    start = predict(weights, field.images, field.normals, threads=context.threads)
+    found = start
+    if weights.signal and len(field):
+        found = _descended(field, start, CoherentOptions(steps=steps), payload, context)
+    inside = ((field.place >= (block.row, block.column)) & (field.place < _end(block))).all(axis=1)
+    return RefineResult(
+        block=block,
+        lobes=context.put_blob(pack(_KIND, {}, {"lobes": found[inside], "place": field.place[inside]})),
+        texels=int(inside.sum()),
+        steps=steps,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def read_lobes(data: bytes) -> tuple[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]], Float32]:
+    """(rows, columns) in the light map and lobes [T, N, 7] in scene units of a refined block."""
+    _, arrays = unpack(_KIND, data)
+    place = arrays["place"].astype(np.int64)
+    return (place[:, 0], place[:, 1]), np.asarray(arrays["lobes"], np.float32)
+
+
+def _descended(
+    field: TexelField, start: Float32, options: CoherentOptions, payload: RefinePayload, context: Context
+) -> Float32:
+    scale = torch.tensor([1.0] * (LOBE_PARAMETERS - 3) + [field.exposure] * 3)
+    where = f"block {payload.block.row},{payload.block.column}"
+
+    def on_step(step: int, _: torch.Tensor) -> None:
+        context.progress(step, options.steps, "steps", where)
+
+    seed = payload.settings.seed
+    found = descend(field, torch.from_numpy(start) * scale, options, seed, threads=context.threads, on_step=on_step)
+    lobes = (found / scale).numpy()
+    lobes[..., 4:] = np.minimum(lobes[..., 4:], FP16_MAX)
+    return lobes
+
+
+def _end(block: Block) -> tuple[int, int]:
+    return block.row + block.size, block.column + block.size
+
+
+def _read_field(
+    store: LightFieldStore,
+    texel_map: TexelMap,
+    moved: tuple[TexelMap, ...],
+    tiles: list[Tile],
+    block: Block,
+    exposure: float,
+) -> TexelField:
+    """The valid texels within the block and its halo, and what was traced between them, tile by tile."""
+    places, images = [], []
+    ordered = sorted(tiles, key=lambda tile: (tile.row, tile.column))
+    for tile, inside in _wanted(texel_map, ordered, block):
+        places.append(np.stack(map_coordinates(tile, inside), axis=1))
+        images.append(store.read_tile(Function.LIGHT_FIELD, tile, inside))
+    size = store.image_size
+    place = np.concatenate([np.empty((0, 2), np.int64), *places])
+    at = place[:, 0], place[:, 1]
+    field = TexelField(
+        np.concatenate([np.empty((0, size, size, 3), np.float16), *images]),
+        texel_map.normal[at],
+        place,
+        texel_map.chart[at].astype(np.int64),
+        exposure,
+    )
+    if not moved or not len(field):
+        return field
+    traced = _read_between(store, field, moved, list(_wanted(texel_map, ordered, block)))
+    return TexelField(field.images, field.normals, field.place, field.chart, exposure, traced)
+
+
+def _wanted(texel_map: TexelMap, tiles: list[Tile], block: Block) -> Iterator[tuple[Tile, npt.NDArray[np.int64]]]:
+    """Each tile with those of its valid texels that lie in the block or its halo, where there are any."""
+    low = np.array([block.row, block.column]) - REFINE_HALO
+    high = np.array(_end(block)) + REFINE_HALO
+    for tile in tiles:
+        inside = valid_texels(texel_map.state, tile)
+        place = np.stack(map_coordinates(tile, inside), axis=1)
+        chosen = inside[((place >= low) & (place < high)).all(axis=1)]
+        if len(chosen):
+            yield tile, chosen
+
+
+def _read_between(
+    store: LightFieldStore,
+    field: TexelField,
+    moved: tuple[TexelMap, ...],
+    wanted: list[tuple[Tile, npt.NDArray[np.int64]]],
+) -> BetweenTargets:
+    """What was traced at the field's between points; points that do not count are left out."""
+    between, half = field.between, store.image_size // 2
+    grid = np.full(moved[0].state.shape, -1, np.int64)
+    row, column = field.place.T
+    grid[row, column] = np.arange(len(field))
+    texel_images = np.empty((len(field), len(BETWEEN_STEPS), half, half, 3), np.float16)
+    for tile, inside in wanted:
+        texel_images[grid[map_coordinates(tile, inside)]] = store.read_between(tile, inside)
+    points, normals, offsets, images = [], [], [], []
+    for kind, step in enumerate(BETWEEN_STEPS):
+        mine = np.flatnonzero((between.step == step).all(axis=1))
+        first = between.first[mine]
+        counts = moved[kind].state[row[first], column[first]] == TexelState.VALID
+        mine, first = mine[counts], first[counts]
+        at = row[first], column[first]
+        points.append(mine)
+        normals.append(moved[kind].normal[at])
+        offsets.append(sparse_offsets(*at, kind))
+        images.append(texel_images[first, kind])
+    return BetweenTargets(*(np.concatenate(parts) for parts in (points, normals, offsets, images)))
