@@ -73,7 +73,7 @@ class RenderPayload(Contract):
     kind: Literal[TaskKind.RENDER] = TaskKind.RENDER
     scene: Sha256
     texel_map: Sha256
-    between: tuple[Sha256, ...]
+    between: tuple[Sha256, ...] = ()
     """Texel maps of the between points, one a kind (`PrepareResult.between`)."""
     tile: Tile
     settings: BakeSettings
@@ -95,7 +95,7 @@ class RefinePayload(Contract):
     kind: Literal[TaskKind.REFINE] = TaskKind.REFINE
     block: Block
     texel_map: Sha256
-    between: tuple[Sha256, ...]
+    between: tuple[Sha256, ...] = ()
     renders: tuple["RenderResult", ...]
     """Of the tiles within the block and `conventions.REFINE_HALO` texels around it."""
     fit: "FitResult"
@@ -111,7 +111,7 @@ class PackagePayload(Contract):
     prepare: "PrepareResult"
     renders: tuple["RenderResult", ...]
     fits: tuple["FitResult", ...]
-    refines: tuple["RefineResult", ...]
+    refines: tuple["RefineResult", ...] = ()
     """Of the light field, one a block; none where the network's lobes are final."""
     settings: BakeSettings
     store_url: str

@@ -1,7 +1,8 @@
-"""The four stages in one process, on a room: what the package's textures hold is what the networks gave."""
+"""The stages in one process, on a room: what the package's textures hold is what the fit gave."""
 
 import hashlib
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from kiln_schemas.gates import Gates
 from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import Function, make_settings
 from kiln_schemas.tasks import (
+    Block,
     Bundle,
     EnvironmentRef,
     FitPayload,
@@ -27,9 +29,12 @@ from kiln_schemas.tasks import (
     PackageResult,
     PreparePayload,
     PrepareResult,
+    RefinePayload,
+    RefineResult,
     RenderPayload,
     RenderResult,
 )
+from kiln_workers.fit.metrics import TexelErrors, texel_errors
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.package import ktx2
 from kiln_workers.package.exr import write_rgb
@@ -43,8 +48,9 @@ from kiln_workers.shade.image_metrics import flip
 from kiln_workers.shade.package import ShadePackage, read_manifest
 from kiln_workers.shade.picture import shade
 from kiln_workers.shade.reference import path_trace
-from kiln_workers.stages import fit, gates, package, prepare, render
+from kiln_workers.stages import fit, gates, package, prepare, refine, render
 from kiln_workers.stages.tiles import covered_texels, map_coordinates, plan_tiles, with_render_verdict
+from kiln_workers.store.layout import BETWEEN_STEPS
 from kiln_workers.store.light_field import LightFieldStore
 
 FRONT = Camera(position=(0.3, 1.1, 3.6), target=(0.0, 0.9, -0.5), fov_deg=45)
@@ -102,6 +108,8 @@ class Baked:
     prepared: PrepareResult
     renders: tuple[RenderResult, ...]
     fits: tuple[FitResult, ...]
+    refine_payloads: tuple[RefinePayload, ...]
+    refines: tuple[RefineResult, ...]
     packaged: PackageResult
 
     def artifact(self, name: str) -> bytes:
@@ -112,6 +120,7 @@ class Baked:
         return RenderPayload(
             scene=self.prepared.scene,
             texel_map=self.prepared.texel_map,
+            between=self.prepared.between,
             tile=self.prepared.tiles[index],
             settings=self.prepare_payload.settings,
             store_url=self.prepare_payload.store_url,
@@ -133,7 +142,9 @@ def baked(tmp_path_factory: pytest.TempPathFactory) -> Baked:
     common: dict[str, Any] = {"settings": settings, "store_url": url}
     renders = tuple(
         render.run(
-            RenderPayload(scene=prepared.scene, texel_map=prepared.texel_map, tile=tile, **common),
+            RenderPayload(
+                scene=prepared.scene, texel_map=prepared.texel_map, between=prepared.between, tile=tile, **common
+            ),
             context,
         )
         for tile in prepared.tiles
@@ -142,6 +153,18 @@ def baked(tmp_path_factory: pytest.TempPathFactory) -> Baked:
         fit.run(FitPayload(function=f, texel_map=prepared.texel_map, renders=renders, **common), context)
         for f in Function
     )
+    refine_payloads = tuple(
+        RefinePayload(
+            block=Block(row=row, column=column, size=8),
+            texel_map=prepared.texel_map,
+            between=prepared.between,
+            renders=renders,
+            fit=fits[0],
+            **common,
+        )
+        for row, column in ((0, 0), (0, 8), (8, 0), (8, 8))
+    )
+    refines = tuple(refine.run(payload, context) for payload in refine_payloads)
     packaged = package.run(
         PackagePayload(
             job_id="j",
@@ -150,34 +173,98 @@ def baked(tmp_path_factory: pytest.TempPathFactory) -> Baked:
             prepare=prepared,
             renders=renders,
             fits=fits,
+            refines=refines,
             gates=GATES,
             cameras={"front": FRONT},
             **common,
         ),
         context,
     )
-    return Baked(context, asked, prepared, renders, fits, packaged)
+    return Baked(context, asked, prepared, renders, fits, refine_payloads, refines, packaged)
 
 
-@pytest.mark.parametrize("function", list(Function))
-def test_texture_holds_the_networks_output(baked: Baked, function: Function) -> None:
-    """At every valid texel the stored lobes are the network's, up to fp16: axes, sharpness and amplitude."""
-    fitted = next(f for f in baked.fits if f.function is function)
-    name = {Function.LIGHT_FIELD: "lightfield.ktx2", Function.VISIBILITY: "visibility.ktx2"}[function]
-    stored = layers_to_lobes(ktx2.decode(baked.artifact(name)).levels[0][:, 0])
+def _valid(baked: Baked, function: Function) -> Iterator[tuple[tuple[Any, Any], Any, Any]]:
+    """(rows, columns), images and normals of the valid texels, tile by tile."""
     texel_map = with_render_verdict(unpack_texel_map(baked.context.blob(baked.prepared.texel_map)), baked.renders)
     store = LightFieldStore.open(baked.prepare_payload.store_url)
-    compared = 0
     for tile in baked.prepared.tiles:
         inside = covered_texels(texel_map, tile)
         place = map_coordinates(tile, inside)
         valid = texel_map.state[place] == TexelState.VALID
         inside, place = inside[valid], (place[0][valid], place[1][valid])
-        images = store.read_tile(function, tile, inside)
-        expected = predict(Weights.from_bytes(baked.context.blob(fitted.weights)), images, texel_map.normal[place])
+        yield place, store.read_tile(function, tile, inside), texel_map.normal[place]
+
+
+def _texture(baked: Baked, name: str) -> Any:
+    return layers_to_lobes(ktx2.decode(baked.artifact(name)).levels[0][:, 0])
+
+
+def test_visibility_holds_the_networks_output(baked: Baked) -> None:
+    """At every valid texel the stored lobes are the network's, up to fp16: axes, sharpness and amplitude."""
+    stored, compared = _texture(baked, "visibility.ktx2"), 0
+    weights = Weights.from_bytes(baked.context.blob(baked.fits[1].weights))
+    for place, images, normals in _valid(baked, Function.VISIBILITY):
+        expected = predict(weights, images, normals)
         np.testing.assert_allclose(stored[place], expected, rtol=2.0**-10, atol=2.0**-11)
-        compared += len(inside)
-    assert compared == fitted.metrics.texels > 50
+        compared += len(images)
+    assert compared == baked.fits[1].metrics.texels > 50
+
+
+def test_light_field_holds_the_refined_lobes(baked: Baked) -> None:
+    """Every valid texel is in one block; its lobes are the block's up to fp16, and better than the network's."""
+    stored, compared = _texture(baked, "lightfield.ktx2"), 0
+    for result in baked.refines:
+        place, lobes = refine.read_lobes(baked.context.blob(result.lobes))
+        np.testing.assert_allclose(stored[place], lobes, rtol=2.0**-10, atol=2.0**-11)
+        compared += result.texels
+    network = baked.fits[0].metrics
+    assert compared == network.texels > 50
+    weights = Weights.from_bytes(baked.context.blob(baked.fits[0].weights))
+    parts = [
+        texel_errors(stored[p].astype(np.float32), i, n, weights.exposure)
+        for p, i, n in _valid(baked, Function.LIGHT_FIELD)
+    ]
+    refined = TexelErrors.join(parts).log_mse
+    assert refined < network.log_mse
+    manifest = Manifest.model_validate_json(baked.artifact("manifest.json"))
+    assert manifest.metrics.light_field is not None
+    assert manifest.metrics.light_field.log_mse == pytest.approx(refined, rel=1e-6)
+
+
+def test_refining_a_block_again_gives_the_same_bytes(baked: Baked) -> None:
+    """On another number of threads, and with tiles that do not touch the block."""
+    context = MemoryContext(scratch=baked.context.scratch, blobs=dict(baked.context.blobs), threads=1)
+    again = refine.run(baked.refine_payloads[1], context)
+    assert again.lobes == baked.refines[1].lobes
+
+
+def test_light_fields_between_are_those_of_a_texel_map_moved_by_half_a_texel(baked: Baked) -> None:
+    """What the store holds between two texels lies between them in brightness, and is nothing where no point counts."""
+    store = LightFieldStore.open(baked.prepare_payload.store_url)
+    texel_map = unpack_texel_map(baked.context.blob(baked.prepared.texel_map))
+    moved = [unpack_texel_map(baked.context.blob(digest)) for digest in baked.prepared.between]
+    brightness, expected, empty = [], [], 0
+    means = np.zeros(texel_map.state.shape)
+    for place, images, _ in _valid(baked, Function.LIGHT_FIELD):
+        means[place] = images.astype(np.float64).mean(axis=(1, 2, 3))
+    for tile in baked.prepared.tiles:
+        inside = covered_texels(texel_map, tile)
+        rows, columns = map_coordinates(tile, inside)
+        sparse = store.read_between(tile, inside).astype(np.float64).mean(axis=(2, 3, 4))
+        for kind, (down, right) in enumerate(BETWEEN_STEPS):
+            counts = moved[kind].state[rows, columns] == TexelState.VALID
+            empty += int(np.count_nonzero(~counts))
+            assert not sparse[~counts, kind].any()
+            r, c = rows[counts], columns[counts]
+            near = moved[kind].position[r, c] - 0.5 * (
+                texel_map.position[r, c] + texel_map.position[r + down, c + right]
+            )
+            assert np.abs(near).max() < 1e-3, "the room is flat"
+            brightness += sparse[counts, kind].tolist()
+            expected += (0.5 * (means[r, c] + means[r + down, c + right])).tolist()
+    assert empty > 0 and len(brightness) > 100
+    assert np.corrcoef(brightness, expected)[0, 1] > 0.9
+    assert np.mean(brightness) == pytest.approx(np.mean(expected), rel=0.05)
 
 
 def test_rendering_a_tile_again_gives_the_same_result(baked: Baked) -> None:
