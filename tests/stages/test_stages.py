@@ -228,7 +228,7 @@ def test_light_field_holds_the_refined_lobes(baked: Baked) -> None:
     assert refined < network.log_mse
     manifest = Manifest.model_validate_json(baked.artifact("manifest.json"))
     assert manifest.metrics.light_field is not None
-    assert manifest.metrics.light_field.log_mse == pytest.approx(refined, rel=1e-6)
+    assert manifest.metrics.light_field.log_mse == pytest.approx(refined, rel=1e-3)
 
 
 def test_refining_a_block_again_gives_the_same_bytes(baked: Baked) -> None:

@@ -41,8 +41,21 @@ def between_maps(scene: Scene, texel_map: TexelMap, device: Device = "auto") -> 
     made = []
     for step in BETWEEN_STEPS:
         moved, usable = _moved_map(scene, texel_map, step, device)
+        usable &= _between_one_chart(texel_map, step)
         made.append(replace(moved, state=np.where(usable, TexelState.VALID, TexelState.GUTTER).astype(np.uint8)))
     return tuple(made)
+
+
+def _between_one_chart(texel_map: TexelMap, step: tuple[int, int]) -> Bools:
+    """Texels [H, W] from which a step leads to a point whose corners are all valid and of one chart."""
+    chart = np.where(texel_map.state == TexelState.VALID, texel_map.chart, -1)
+    height, width = chart.shape
+    padded = np.full((height + 1, width + 1), -1, chart.dtype)
+    padded[:height, :width] = chart
+    out = chart >= 0
+    for down, right in ((step[0], 0), (0, step[1]), step):
+        out &= padded[down : down + height, right : right + width] == chart
+    return out
 
 
 def trace_sparse(
