@@ -90,7 +90,7 @@ class FitPayload(Contract):
 
 
 class RefinePayload(Contract):
-    """Make the lobes of a block coherent, from the network's (`kiln_workers.fit.coherent`)."""
+    """Make the lobes of a block coherent, from the network's (`kiln_workers.fit.solvers.joint`)."""
 
     kind: Literal[TaskKind.REFINE] = TaskKind.REFINE
     block: Block
@@ -190,7 +190,7 @@ class RefineResult(Contract):
     kind: Literal[TaskKind.REFINE] = TaskKind.REFINE
     block: Block
     lobes: Sha256
-    """Lobes [T, N, 7] in scene units of the block's T valid texels, row by row (`kiln_workers.fit.coherent`)."""
+    """Lobes [T, N, 7] in scene units of the block's T valid texels, row by row (`kiln_workers.fit.solvers.joint`)."""
     texels: int
     steps: int
     seconds: float

@@ -15,10 +15,12 @@ from kiln_schemas.errors import InputError, TooLarge
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.compare.subject import Subject
+from kiln_workers.fit.between import read_between
 from kiln_workers.fit.field import TexelField
 from kiln_workers.fit.source import valid_texels
+from kiln_workers.render.between import between_maps
 from kiln_workers.scene.texel_map import TexelMap, TexelState
-from kiln_workers.scene.texels import rasterise_texels
+from kiln_workers.scene.texels import build_texel_map, rasterise_texels
 from kiln_workers.stages.tiles import map_coordinates, plan_tiles
 
 DEFAULT_BYTES: Final = 2 << 30
@@ -46,6 +48,8 @@ class ChosenTexels:
         out = sha256(repr(self.field.exposure).encode())
         for values in (self.field.images, self.field.normals, self.field.place, self.field.chart):
             out.update(np.ascontiguousarray(values).data)
+        if self.field.traced is not None:
+            out.update(np.ascontiguousarray(self.field.traced.images).data)
         return out.hexdigest()
 
 
@@ -93,11 +97,16 @@ def _evenly(planned: list[Tile], count: int) -> list[Tile]:
 
 def _read(subject: Subject, texel_map: TexelMap, tiles: list[Tile]) -> TexelField:
     images, places = [], []
-    for tile in tiles:
-        inside = valid_texels(texel_map.state, tile)
+    wanted = [(tile, valid_texels(texel_map.state, tile)) for tile in tiles]
+    for tile, inside in wanted:
         places.append(np.stack(map_coordinates(tile, inside), axis=1))
         images.append(subject.store.read_tile(Function.LIGHT_FIELD, tile, inside))
     place = np.concatenate(places)
     at = place[:, 0], place[:, 1]
     chart: npt.NDArray[np.int64] = texel_map.chart[at].astype(np.int64)
-    return TexelField(np.concatenate(images), texel_map.normal[at], place, chart, subject.exposure)
+    field = TexelField(np.concatenate(images), texel_map.normal[at], place, chart, subject.exposure)
+    if not subject.store.has_between:
+        return field
+    # The points that counted when the bake was prepared, before rendering found invalid texels.
+    moved = between_maps(subject.scene, build_texel_map(subject.scene, subject.store.shape[0]))
+    return replace(field, traced=read_between(subject.store, field, moved, wanted))

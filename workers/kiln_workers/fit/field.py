@@ -34,7 +34,7 @@ class BetweenPoints:
 
 
 @dataclass(frozen=True)
-class BetweenTargets:
+class TracedBetween:
     """Light fields traced at B of a field's between points, one pixel of each 2 x 2 block."""
 
     points: Index  # [B] into `TexelField.between`
@@ -56,7 +56,7 @@ class TexelField:
     chart: Index  # [T]
     exposure: float
     """Factor from scene radiance to the exposure-normalised radiance of loss and metrics."""
-    traced: BetweenTargets | None = None
+    traced: TracedBetween | None = None
     """What a solver may learn from about the points between; never what `log_mse_between` is measured against."""
 
     def __len__(self) -> int:

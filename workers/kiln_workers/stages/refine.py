@@ -1,4 +1,4 @@
-"""Refine one block of the light field's lobes: from the network's to coherent ones (`fit.solvers.coherent`).
+"""Refine one block of the light field's lobes: from the network's to coherent ones (`fit.solvers.joint`).
 
 A block is solved with `conventions.REFINE_HALO` texels of its neighbours around it, which are then dropped: the lobes
 of a texel near the edge are moved by what lies around it, as its neighbours' are in the block next to it. Memory is
@@ -7,6 +7,7 @@ that of one block's images; a lost task is simply done again, and gives the same
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -16,15 +17,15 @@ import torch
 from kiln_schemas.conventions import FP16_MAX, LOBE_PARAMETERS, REFINE_HALO
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Block, RefinePayload, RefineResult, Tile
-from kiln_workers.fit.field import BetweenTargets, TexelField
+from kiln_workers.fit.between import read_between
+from kiln_workers.fit.field import TexelField
 from kiln_workers.fit.predict import Weights, predict
-from kiln_workers.fit.solvers.coherent import CoherentOptions, descend
+from kiln_workers.fit.solvers.joint import CoherentOptions, descend
 from kiln_workers.fit.source import valid_texels
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.container import pack, unpack
-from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
+from kiln_workers.scene.texel_map import TexelMap, unpack_texel_map
 from kiln_workers.stages.tiles import map_coordinates, with_render_verdict
-from kiln_workers.store.layout import BETWEEN_STEPS, sparse_offsets
 from kiln_workers.store.light_field import LightFieldStore
 
 Float32 = npt.NDArray[np.float32]
@@ -108,8 +109,7 @@ def _read_field(
     )
     if not moved or not len(field):
         return field
-    traced = _read_between(store, field, moved, list(_wanted(texel_map, ordered, block)))
-    return TexelField(field.images, field.normals, field.place, field.chart, exposure, traced)
+    return replace(field, traced=read_between(store, field, moved, _wanted(texel_map, ordered, block)))
 
 
 def _wanted(texel_map: TexelMap, tiles: list[Tile], block: Block) -> Iterator[tuple[Tile, npt.NDArray[np.int64]]]:
@@ -122,31 +122,3 @@ def _wanted(texel_map: TexelMap, tiles: list[Tile], block: Block) -> Iterator[tu
         chosen = inside[((place >= low) & (place < high)).all(axis=1)]
         if len(chosen):
             yield tile, chosen
-
-
-def _read_between(
-    store: LightFieldStore,
-    field: TexelField,
-    moved: tuple[TexelMap, ...],
-    wanted: list[tuple[Tile, npt.NDArray[np.int64]]],
-) -> BetweenTargets:
-    """What was traced at the field's between points; points that do not count are left out."""
-    between, half = field.between, store.image_size // 2
-    grid = np.full(moved[0].state.shape, -1, np.int64)
-    row, column = field.place.T
-    grid[row, column] = np.arange(len(field))
-    texel_images = np.empty((len(field), len(BETWEEN_STEPS), half, half, 3), np.float16)
-    for tile, inside in wanted:
-        texel_images[grid[map_coordinates(tile, inside)]] = store.read_between(tile, inside)
-    points, normals, offsets, images = [], [], [], []
-    for kind, step in enumerate(BETWEEN_STEPS):
-        mine = np.flatnonzero((between.step == step).all(axis=1))
-        first = between.first[mine]
-        counts = moved[kind].state[row[first], column[first]] == TexelState.VALID
-        mine, first = mine[counts], first[counts]
-        at = row[first], column[first]
-        points.append(mine)
-        normals.append(moved[kind].normal[at])
-        offsets.append(sparse_offsets(*at, kind))
-        images.append(texel_images[first, kind])
-    return BetweenTargets(*(np.concatenate(parts) for parts in (points, normals, offsets, images)))

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kiln_workers.fit.field import BetweenTargets, TexelField
+from kiln_workers.fit.field import TexelField, TracedBetween
 from kiln_workers.fit.lobes import constrain
 from kiln_workers.fit.metrics import horizon_weights
 from kiln_workers.fit.network import pixel_centres
@@ -146,7 +146,7 @@ class _Problem:
         out = torch.empty_like(lobes)
         self._add_up(out, lobes, self._texels, TEXEL_PIXELS, rng)
         if self._points:
-            variable = lobes.requires_grad_()
+            variable = lobes.detach().requires_grad_()
             mixed = mixed_lobes(variable, self._corners, lobes.new_full((len(self._corners), 4), 0.25))
             by_mixed = torch.empty_like(mixed)
             self._add_up(by_mixed, mixed.detach(), self._points, BETWEEN_PIXELS, rng)
@@ -182,7 +182,7 @@ class _Problem:
             pass
 
 
-def mean_targets(field: TexelField) -> BetweenTargets:
+def mean_targets(field: TexelField) -> TracedBetween:
     """What is taken for the light fields at all between points where none were traced: the mean of their corners'.
 
     Of those corners whose horizon a pixel's centre is above: below it an image holds nothing.
@@ -204,10 +204,10 @@ def mean_targets(field: TexelField) -> BetweenTargets:
             images[part] = (total / np.maximum(weight.sum(axis=1), 1.0)).astype(np.float16)
     normals = field.normals[between.corners].mean(axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)
-    return BetweenTargets(np.arange(len(between)), normals.astype(np.float32), offsets, images)
+    return TracedBetween(np.arange(len(between)), normals.astype(np.float32), offsets, images)
 
 
-def _gather_between(field: TexelField, targets: BetweenTargets, part: Index) -> Pixels:
+def _gather_between(field: TexelField, targets: TracedBetween, part: Index) -> Pixels:
     """The pixels of some between points that were traced and whose centre is above the horizon there."""
     size, half = field.image_size, field.image_size // 2
     normals = torch.from_numpy(targets.normals[part])
