@@ -5,16 +5,22 @@ Nothing is copied into rows: a fit of a thousand tiles has a row of twenty bytes
 
 from typing import Any
 
+from kiln_schemas.conventions import REFINE_HALO
+from kiln_schemas.settings import Function
 from kiln_schemas.tasks import (
+    Block,
     FitPayload,
     FitResult,
     PackagePayload,
     Payload,
     PreparePayload,
     PrepareResult,
+    RefinePayload,
+    RefineResult,
     RenderPayload,
     RenderResult,
     TaskKind,
+    Tile,
 )
 from kiln_service.db import JobRow, TaskRow, Tx
 
@@ -34,8 +40,20 @@ async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Payload:
                 texel_map=(await tx.one("prepared_blobs", job_id=job.id))["texel_map"],
                 renders=await _renders(tx, job),
             )
+        case TaskKind.REFINE:
+            prepared = await tx.one("prepared_blobs", job_id=job.id)
+            block = Block.model_validate(task.spec["block"])
+            fits = await _fits(tx, job)
+            return RefinePayload(
+                **common,
+                block=block,
+                texel_map=prepared["texel_map"],
+                between=prepared["between"],
+                renders=tuple(result for result in await _renders(tx, job) if _near(result.tile, block)),
+                fit=next(result for result in fits if result.function is Function.LIGHT_FIELD),
+            )
         case TaskKind.PACKAGE:
-            fits = await tx.all("results_of_kind", job_id=job.id, kind=TaskKind.FIT)
+            refines = await tx.all("results_of_kind", job_id=job.id, kind=TaskKind.REFINE)
             return PackagePayload(
                 **common,
                 job_id=job.id,
@@ -43,7 +61,8 @@ async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Payload:
                 bundle=job.bundle,
                 prepare=await _prepared(tx, job),
                 renders=await _renders(tx, job),
-                fits=tuple(FitResult.model_validate(row["result"]) for row in fits),
+                fits=await _fits(tx, job),
+                refines=tuple(RefineResult.model_validate(row["result"]) for row in refines),
                 gates=job.gates,
                 cameras=job.cameras,
             )
@@ -52,6 +71,17 @@ async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Payload:
 async def _prepared(tx: Tx, job: JobRow) -> PrepareResult:
     row = await tx.one("results_of_kind", job_id=job.id, kind=TaskKind.PREPARE)
     return PrepareResult.model_validate(row["result"])
+
+
+async def _fits(tx: Tx, job: JobRow) -> tuple[FitResult, ...]:
+    rows = await tx.all("results_of_kind", job_id=job.id, kind=TaskKind.FIT)
+    return tuple(FitResult.model_validate(row["result"]) for row in rows)
+
+
+def _near(tile: Tile, block: Block) -> bool:
+    """Whether a tile has texels in a block or its halo."""
+    starts = ((tile.row, block.row), (tile.column, block.column))
+    return all(t < b + block.size + REFINE_HALO and t + tile.size > b - REFINE_HALO for t, b in starts)
 
 
 async def _renders(tx: Tx, job: JobRow) -> tuple[RenderResult, ...]:

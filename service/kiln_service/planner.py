@@ -2,17 +2,19 @@
 
 A method is a sequence of stages. The tasks of a stage are planned when the result that determines them is
 there, and released when every task of the stage before has completed. `sg_lightfield` (Currius et al. 2020)
-is the first method: prepare > render (one task a tile) > fit (one task a function) > package.
+is the first method: prepare > render (one task a tile) > fit (one task a function) > refine (one task a block of the
+light map, unless the network's lobes are final) > package.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, Final
 
 from kiln_schemas.errors import InputError, TooLarge
 from kiln_schemas.gates import VISIBILITY_LOG_MSE_REL, Gates
-from kiln_schemas.settings import BakeSettings, Function
-from kiln_schemas.tasks import PrepareResult, TaskKind
+from kiln_schemas.settings import BakeSettings, Function, Solver
+from kiln_schemas.tasks import Block, PrepareResult, TaskKind, Tile
 
 
 @dataclass(frozen=True)
@@ -34,13 +36,13 @@ class Method:
     stages: tuple[TaskKind, ...]
 
     def stage_after(self, kind: TaskKind) -> TaskKind | None:
-        """The stage that the last task of `kind` releases; None when the job is done then."""
+        """The stage after `kind`, of which a job may have no task; None after the last."""
         place = self.stages.index(kind) + 1
         return self.stages[place] if place < len(self.stages) else None
 
 
 SG_LIGHTFIELD: Final = Method(
-    name="sg_lightfield", stages=(TaskKind.PREPARE, TaskKind.RENDER, TaskKind.FIT, TaskKind.PACKAGE)
+    name="sg_lightfield", stages=(TaskKind.PREPARE, TaskKind.RENDER, TaskKind.FIT, TaskKind.REFINE, TaskKind.PACKAGE)
 )
 
 METHODS: Final[Mapping[str, Method]] = {SG_LIGHTFIELD.name: SG_LIGHTFIELD}
@@ -49,7 +51,8 @@ PRIORITY: Final[Mapping[TaskKind, int]] = {
     TaskKind.PREPARE: 0,
     TaskKind.RENDER: 1,
     TaskKind.FIT: 2,
-    TaskKind.PACKAGE: 3,
+    TaskKind.REFINE: 3,
+    TaskKind.PACKAGE: 4,
 }
 """Later stages first: a job that is nearly done finishes before another begins."""
 
@@ -60,7 +63,7 @@ def plan_job() -> list[Planned]:
 
 
 def plan_after_prepare(result: PrepareResult, settings: BakeSettings, gates: Gates, most_tiles: int) -> list[Planned]:
-    """Render tasks (ready), fit tasks and the package task (waiting).
+    """Render tasks (ready); fit tasks, refine tasks and the package task (waiting).
 
     InputError where there is nothing to bake, the tiles do not fit the light map or a gate has nothing to measure.
     """
@@ -77,7 +80,23 @@ def plan_after_prepare(result: PrepareResult, settings: BakeSettings, gates: Gat
     ]
     functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if result.has_environment else [])
     fits = [Planned(TaskKind.FIT, function.value, {"function": function.value}) for function in functions]
-    return [*renders, *fits, Planned(TaskKind.PACKAGE, "package")]
+    blocks = plan_blocks(result.tiles, settings) if settings.fit.solver is Solver.COHERENT else []
+    refines = [
+        Planned(TaskKind.REFINE, f"block {block.row},{block.column}", {"block": block.model_dump(mode="json")})
+        for block in blocks
+    ]
+    return [*renders, *fits, *refines, Planned(TaskKind.PACKAGE, "package")]
+
+
+def plan_blocks(tiles: Iterable[Tile], settings: BakeSettings) -> list[Block]:
+    """Squares of `fit.block` texels, row by row, that a tile touches."""
+    size, resolution = settings.fit.block, settings.lightmap.resolution
+    places = set()
+    for tile in tiles:
+        rows = range(tile.row // size, (min(tile.row + tile.size, resolution) - 1) // size + 1)
+        columns = range(tile.column // size, (min(tile.column + tile.size, resolution) - 1) // size + 1)
+        places |= set(product(rows, columns))
+    return [Block(row=row * size, column=column * size, size=size) for row, column in sorted(places)]
 
 
 def _check_prepared(result: PrepareResult, settings: BakeSettings, most_tiles: int) -> None:

@@ -25,6 +25,7 @@ from kiln_schemas.tasks import (
     HeartbeatReply,
     PackageResult,
     PrepareResult,
+    RefineResult,
     RenderResult,
     Result,
     TaskKind,
@@ -244,15 +245,22 @@ async def _seen(tx: Tx, worker_id: str) -> WorkerRow:
 
 async def _fan_in(tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
     """After a completed task: release the next stage, or finish the job, if it was its stage's last."""
-    if (await tx.one("count_unfinished", job_id=job.id, kind=task.kind))["tasks"]:
+    if await _unfinished(tx, job, task.kind):
         return
     stage = METHODS[job.method].stage_after(task.kind)
+    while stage is not None and not await _unfinished(tx, job, stage):
+        stage = METHODS[job.method].stage_after(stage)
     if stage is None:
         await transitions.finish_job(tx, job, result.gates if isinstance(result, PackageResult) else ())
         return
     await add_event(tx, job.id, "stage.completed", transitions.COORDINATOR, detail={"kind": task.kind.value})
     for row in await tx.all("tasks_in_state", job_id=job.id, kind=stage, state=TaskState.WAITING):
         await transitions.release_task(tx, TaskRow.of(row))
+
+
+async def _unfinished(tx: Tx, job: JobRow, kind: TaskKind) -> int:
+    """Tasks of a kind that have not completed; none also where the job has no such task."""
+    return int((await tx.one("count_unfinished", job_id=job.id, kind=kind))["tasks"])
 
 
 def _check_fence(task: TaskRow, attempt: int) -> None:
@@ -281,6 +289,8 @@ def _check_result(job: JobRow, task: TaskRow, result: Result) -> None:
         given = {"tile": result.tile.model_dump(mode="json")}
     elif isinstance(result, FitResult):
         given = {"function": result.function.value}
+    elif isinstance(result, RefineResult):
+        given = {"block": result.block.model_dump(mode="json")}
     if given is not None and given != task.spec:
         raise InputError(f"the result is of {given}, the task is {task.spec}", where="result")
     if isinstance(result, PackageResult):
@@ -296,9 +306,11 @@ def _blobs_of(result: Result) -> list[str]:
     """Hashes that the result names."""
     match result:
         case PrepareResult():
-            return [result.scene, result.texel_map]
+            return [result.scene, result.texel_map, *result.between]
         case FitResult():
             return [result.weights]
+        case RefineResult():
+            return [result.lobes]
         case PackageResult():
             return [artifact.sha256 for artifact in result.artifacts]
         case RenderResult():

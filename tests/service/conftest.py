@@ -108,7 +108,7 @@ class FakeWorker:
         self.home, self.name = coordinator, name
         registration = {
             "name": name,
-            "kinds": ["prepare", "render", "fit", "package"],
+            "kinds": ["prepare", "render", "fit", "refine", "package"],
             "memory_bytes": 2**30,
             "threads": 1,
             "device": "none",
@@ -118,7 +118,7 @@ class FakeWorker:
         self.id = welcome["worker_id"]
 
     def claim(self, *kinds: str, wait_s: float = 0) -> dict[str, Any] | None:
-        body = {"kinds": kinds or ("prepare", "render", "fit", "package"), "wait_s": wait_s}
+        body = {"kinds": kinds or ("prepare", "render", "fit", "refine", "package"), "wait_s": wait_s}
         reply = self.home.client.post(f"/v1/workers/{self.id}/claim", json=body).raise_for_status()
         return None if reply.status_code == 204 else reply.json()
 
@@ -166,6 +166,7 @@ def result_of(home: Coordinator, claim: dict[str, Any], tiles: int = 2, **change
             result = {
                 "scene": home.upload(b"packed scene"),
                 "texel_map": home.upload(b"texel map"),
+                "between": [home.upload(f"points {kind}".encode()) for kind in range(3)],
                 "scene_hash": "0" * 64,
                 "tiles": places,
                 "has_environment": False,
@@ -185,6 +186,8 @@ def result_of(home: Coordinator, claim: dict[str, Any], tiles: int = 2, **change
                 "curve": [],
                 "steps": 1,
             }
+        case "refine":
+            result = {"block": payload["block"], "lobes": home.upload(b"lobes"), "texels": 10, "steps": 1}
         case _:
             data = b"0123456789" * 100
             files = {"lightfield.ktx2": "image/ktx2", "shaders/light.glsl": "text/plain"}

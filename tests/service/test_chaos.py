@@ -66,7 +66,8 @@ def check(home, job):
             ("prepare", 1),
             ("render", 6),
             ("fit", 2),
+            ("refine", 1),
             ("package", 1),
         ]
         assert all(task["state"] == "completed" for task in tasks)
-        assert kinds.count("stage.completed") == 3 and kinds.count("job.completed") == 1
+        assert kinds.count("stage.completed") == 4 and kinds.count("job.completed") == 1

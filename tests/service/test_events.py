@@ -43,7 +43,7 @@ def test_a_stream_follows_the_job_and_ends_with_it(home):
     assert [entry[2] for entry in got] == home.events(job["id"])
     kinds = [entry[1] for entry in got]
     assert kinds[:4] == ["job.created", "tasks.planned", "job.active", "task.claimed"]
-    assert kinds[-1] == "job.completed" and kinds.count("stage.completed") == 3
+    assert kinds[-1] == "job.completed" and kinds.count("stage.completed") == 4
     ids = [entry[0] for entry in got]
     assert ids == sorted(set(ids))
 

@@ -162,12 +162,25 @@ def test_an_old_database_keeps_its_jobs(start, dsn, monkeypatch):
             )
         with pytest.raises(psycopg.errors.CheckViolation):
             connection.execute("UPDATE jobs SET state = 'gate-failed'")
+        insert = (
+            "INSERT INTO tasks (id, job_id, ordinal, kind, label, state, spec)"
+            " VALUES (%s, %s, 1, %s, 'x', 'waiting', '{}')"
+        )
+        connection.execute(insert, ["c" * 32, "a" * 32, "package"])
+        with pytest.raises(psycopg.errors.CheckViolation):
+            connection.execute(insert, ["d" * 32, "a" * 32, "refine"])
     with start() as home:
-        assert home.sql("SELECT version FROM kiln_migrations ORDER BY version") == [{"version": 1}, {"version": 2}]
+        assert home.sql("SELECT version FROM kiln_migrations ORDER BY version") == [
+            {"version": 1},
+            {"version": 2},
+            {"version": 3},
+        ]
         for job_id, state in jobs.items():
             view = home.job(job_id)
             assert (view["name"], view["state"], view["gate_results"], view["cameras"]) == ("old", state, [], {})
             assert view["gates"] == {"log_mse_rel": None, "visibility_log_mse_rel": None, "flip": {}}
+        assert home.sql("SELECT kind FROM tasks") == [{"kind": "package"}]
+        home.sql("UPDATE tasks SET kind = 'refine'")
         home.sql("UPDATE jobs SET state = 'gate-failed'")
         assert {job["state"] for job in home.client.get("/v1/jobs").json()["jobs"]} == {"gate-failed"}
     assert asyncio.run(migrated(dsn)) == []

@@ -21,7 +21,8 @@ def test_a_job_runs_through_all_stages(home):
     worker.finish(claim, tiles=3, has_environment=True)
 
     states = {(task["kind"], task["state"]) for task in home.tasks(job["id"])}
-    assert states == {("prepare", "completed"), ("render", "queued"), ("fit", "waiting"), ("package", "waiting")}
+    later = {(kind, "waiting") for kind in ("fit", "refine", "package")}
+    assert states == {("prepare", "completed"), ("render", "queued"), *later}
     renders = [worker.must_claim() for _ in range(3)]
     assert worker.claim() is None, "fits wait for the last tile"
     assert [claim["payload"]["tile"]["column"] for claim in renders] == [0, 8, 16]
@@ -34,7 +35,19 @@ def test_a_job_runs_through_all_stages(home):
     for claim in fits:
         worker.finish(claim)
 
+    refine = worker.must_claim()
+    payload = refine["payload"]
+    assert worker.claim() is None, "the package waits for the last block"
+    assert payload["block"] == {"row": 0, "column": 0, "size": 32} and len(payload["between"]) == 3
+    assert payload["fit"]["function"] == "light_field" and len(payload["renders"]) == 3
+    elsewhere = {"row": 32, "column": 0, "size": 32}
+    wrong = {"kind": "refine", "block": elsewhere, "lobes": "0" * 64, "texels": 1, "steps": 1, "seconds": 1.0}
+    refused = worker.commit(refine, wrong)
+    assert refused.status_code == 422 and "block" in refused.json()["detail"]
+    worker.finish(refine)
+
     claim = worker.must_claim()
+    assert [result["block"]["row"] for result in claim["payload"]["refines"]] == [0]
     assert claim["payload"]["job_id"] == job["id"] and len(claim["payload"]["fits"]) == 2
     assert home.client.get(f"/v1/jobs/{job['id']}/artifacts").json() == []
     worker.finish(claim)
@@ -46,11 +59,32 @@ def test_a_job_runs_through_all_stages(home):
         "prepare": (1, 1, 1.0),
         "render": (3, 3, 1.0),
         "fit": (2, 2, 1.0),
+        "refine": (1, 1, 1.0),
         "package": (1, 1, 1.0),
     }
     names = [artifact["name"] for artifact in home.client.get(f"/v1/jobs/{job['id']}/artifacts").json()]
     assert names == ["lightfield.ktx2", "shaders/light.glsl"]
     assert home.sql("SELECT count(*) AS left FROM procrastinate_jobs") == [{"left": 0}]
+
+
+def test_a_block_gets_the_tiles_around_it(home):
+    """Tiles at columns 0, 8, 16 and 24: the first block of 16 texels needs none of the last, whose halo is 4."""
+    job, worker = home.submit(set=["fit.block=16"]), home.worker()
+    worker.advance(job["id"], "refine", tiles=4)
+    blocks = [worker.must_claim()["payload"] for _ in range(2)]
+    columns = {b["block"]["column"]: [r["tile"]["column"] for r in b["renders"]] for b in blocks}
+    assert columns == {0: [0, 8, 16], 16: [8, 16, 24]}
+
+
+def test_the_networks_lobes_may_be_final(home):
+    """Without refine tasks the package follows the last fit."""
+    job, worker = home.submit(set=["fit.solver=cnn"]), home.worker()
+    worker.advance(job["id"], "package")
+    assert home.tasks(job["id"], kind="refine") == []
+    claim = worker.must_claim()
+    assert claim["payload"]["refines"] == []
+    worker.finish(claim)
+    assert home.job(job["id"])["state"] == "completed"
 
 
 def test_without_an_environment_there_is_no_visibility_to_fit(home):

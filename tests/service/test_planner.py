@@ -6,10 +6,10 @@ import pytest
 
 from kiln_schemas.errors import InputError, TooLarge
 from kiln_schemas.gates import Gates
-from kiln_schemas.settings import PRESETS
+from kiln_schemas.settings import PRESETS, make_settings
 from kiln_schemas.tasks import PrepareResult, TaskKind, Tile
 from kiln_service.ids import new_id
-from kiln_service.planner import SG_LIGHTFIELD, plan_after_prepare, plan_job
+from kiln_service.planner import SG_LIGHTFIELD, plan_after_prepare, plan_blocks, plan_job
 from kiln_service.views import remaining_seconds
 
 
@@ -36,10 +36,22 @@ def test_the_plan():
         "tile 8,0",
         "light_field",
         "visibility",
+        "block 0,0",
         "package",
     ]
-    assert [task.ready for task in planned] == [True, True, True, False, False, False]
+    assert [task.ready for task in planned] == [True, True, True, False, False, False, False]
     assert planned[1].spec == {"tile": {"row": 0, "column": 8, "size": 8, "texels": 3}}
+
+
+def test_blocks_are_those_that_tiles_touch():
+    """Also where tiles do not lie on the grid of the blocks; none where the network's lobes are final."""
+    settings = make_settings("draft", ["lightmap.tile=24", "fit.block=16"])
+    tiles = [Tile(row=0, column=0, size=24, texels=3), Tile(row=24, column=24, size=24, texels=1)]
+    places = [(block.row, block.column, block.size) for block in plan_blocks(tiles, settings)]
+    assert places == [(0, 0, 16), (0, 16, 16), (16, 0, 16), (16, 16, 16)]
+    network = make_settings("draft", ["fit.solver=cnn"])
+    planned = plan_after_prepare(prepared([tile(0, 0)]), network, Gates(), 100)
+    assert [task.kind for task in planned] == [TaskKind.RENDER, TaskKind.FIT, TaskKind.FIT, TaskKind.PACKAGE]
 
 
 def test_stages_follow_each_other():
@@ -47,7 +59,7 @@ def test_stages_follow_each_other():
     while kind is not None:
         order.append(kind)
         kind = SG_LIGHTFIELD.stage_after(kind)
-    assert order == [TaskKind.PREPARE, TaskKind.RENDER, TaskKind.FIT, TaskKind.PACKAGE]
+    assert order == [TaskKind.PREPARE, TaskKind.RENDER, TaskKind.FIT, TaskKind.REFINE, TaskKind.PACKAGE]
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_kill_and_restart(folder):
         )
         assert commit.status_code == 204
         states = {s["kind"]: s["completed"] for s in second.client.get(f"/v1/jobs/{job['id']}").json()["stages"]}
-        assert states == {"prepare": 1, "render": 0, "fit": 0, "package": 0}
+        assert states == {"prepare": 1, "render": 0, "fit": 0, "refine": 0, "package": 0}
         code, errors = second.stop(signal.SIGTERM)
         assert code == 0 and "Traceback" not in errors
     assert servers_of(folder) == []

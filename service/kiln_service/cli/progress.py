@@ -103,7 +103,7 @@ class LineDisplay:
 
 def counts(stage: StageView) -> str:
     """Finished and planned tasks in their own word."""
-    word = "tiles" if stage.kind is TaskKind.RENDER else "tasks"
+    word = {TaskKind.RENDER: "tiles", TaskKind.REFINE: "blocks"}.get(stage.kind, "tasks")
     return f"{stage.completed}/{stage.total} {word}"
 
 

@@ -30,7 +30,8 @@ SELECT result FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state
 
 -- name: prepared_blobs
 -- The blobs that a job's prepare task made; its whole result may list thousands of tiles.
-SELECT result ->> 'scene' AS scene, result ->> 'texel_map' AS texel_map
+SELECT result ->> 'scene' AS scene, result ->> 'texel_map' AS texel_map,
+       coalesce(result -> 'between', '[]') AS between
 FROM tasks WHERE job_id = %(job_id)s AND kind = 'prepare' AND state = 'completed';
 
 -- name: task_deferred

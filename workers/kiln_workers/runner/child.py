@@ -111,7 +111,7 @@ class Child:
 
 def ready(setup: Setup) -> Ready:
     """Name the device, and what it lacks where the kinds of this worker need it."""
-    if set(setup.kinds) == {TaskKind.FIT}:
+    if set(setup.kinds) <= {TaskKind.FIT, TaskKind.REFINE}:
         return Ready(device=f"{setup.threads} threads")
     try:
         from kiln_workers.render.backend import select_variant
