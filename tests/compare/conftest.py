@@ -62,7 +62,9 @@ def kept_bake(tmp_path_factory: pytest.TempPathFactory) -> Path:
     prepared = prepare.run(PreparePayload(bundle=bundle, settings=settings, store_url=url), context)  # type: ignore[arg-type]
     common: dict[str, Any] = {"settings": settings, "store_url": url}
     for tile in prepared.tiles:
-        payload = RenderPayload(scene=prepared.scene, texel_map=prepared.texel_map, tile=tile, **common)
+        payload = RenderPayload(
+            scene=prepared.scene, texel_map=prepared.texel_map, between=prepared.between, tile=tile, **common
+        )
         render.run(payload, context)  # type: ignore[arg-type]
     texel_map = unpack_texel_map(context.blob(prepared.texel_map))
     store = LightFieldStore.open(url)

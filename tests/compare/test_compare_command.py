@@ -143,7 +143,7 @@ def test_a_second_run_computes_nothing(
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--solvers", "cnn,magic"], "'magic' is not a solver. Choose some of cnn"),
+        (["--solvers", "cnn,magic"], "'magic' is not a solver. Choose some of coherent, cnn"),
         (["--lobes", "8,900"], "--lobes: '8,900' is refused"),
         (["--resolution-image-size", "20"], "multiple of 16"),
         (["--cameras", "nowhere.json"], "nowhere.json"),

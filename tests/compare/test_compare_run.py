@@ -101,15 +101,15 @@ def test_epochs_to_tolerance() -> None:
     assert epochs_to_tolerance(()) is None
 
 
-def test_estimates_say_when_they_guess() -> None:
+def test_estimates_say_what_they_leave_out() -> None:
     estimate = Estimate([("a", 10.0), ("a", 20.0), ("b", 10.0)])
-    assert estimate.seconds() is None
+    assert estimate.seconds() == (0.0, 2)
     estimate.finished("a", 10.0, 5.0)
-    assert estimate.seconds() == (15.0, False)
+    assert estimate.seconds() == (10.0, 1)
     estimate.finished("b", 10.0, 100.0)
-    assert estimate.seconds() == (10.0, True)
+    assert estimate.seconds() == (10.0, 0)
     estimate.finished("a", 20.0, None)
-    assert estimate.seconds() == (0.0, True)
+    assert estimate.seconds() == (0.0, 0)
 
 
 def test_charts_escape_names() -> None:

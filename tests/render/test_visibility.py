@@ -18,7 +18,8 @@ UP = np.array([0.0, 1.0, 0.0])
 def brute_force(radiance: np.ndarray, w: np.ndarray, alpha: float, open_sky: np.ndarray) -> np.ndarray:
     """Eq. 7 for one direction by a Fibonacci sphere with `radiance` at POINTS, of which `open_sky` are not occluded."""
     cosine = POINTS @ w
-    weight = np.where((cosine > 0.0) & (POINTS @ UP > 0.0), ggx.distribution(np.sqrt(0.5 * (1.0 + cosine)), alpha), 0.0)
+    above = (cosine > 0.0) & (POINTS @ UP > 0.0)
+    weight = np.where(above, cosine * ggx.distribution(np.sqrt(0.5 * (1.0 + cosine)), alpha), 0.0)
     energy = weight[:, None] * radiance
     return np.asarray(energy[open_sky].sum(axis=0) / energy.sum(axis=0))
 

@@ -79,7 +79,7 @@ def test_one_lobe_reflected_near_the_normal(alpha: float) -> None:
         *(torch.from_numpy(value)[None] for value in (normal, view, base)), torch.ones(1), torch.tensor([alpha])
     )
     lobe = torch.from_numpy(np.concatenate([axis, [sharpness], np.ones(3)]))[None, None]
-    made = algorithm.convolved(lobe, algorithm.reflection_kernel(surface)) * algorithm.specular_factor(surface)
+    made = algorithm.convolved(lobe, algorithm.reflection_kernel(surface)) * algorithm.paper_factor(surface)
     for d, tolerance in ((gaussian_d, 0.05), (ggx.distribution(half[:, 2], alpha), 0.25)):
         expected = (d[:, None] * rest).mean(axis=0) * 4.0 * np.pi
         np.testing.assert_allclose(made[0].numpy(), expected, rtol=tolerance)
@@ -93,7 +93,7 @@ def test_a_furnace_reflects_f_g() -> None:
     # A lobe of sharpness 0 has no direction: place its axis where the kernel looks.
     constant[:, 0, :3] = surface.specular
     constant[..., 4:] = 1.0
-    made = algorithm.convolved(constant, algorithm.reflection_kernel(surface)) * algorithm.specular_factor(surface)
+    made = algorithm.convolved(constant, algorithm.reflection_kernel(surface)) * algorithm.paper_factor(surface)
     cosine = surface.cosine.numpy()
     masking = ggx.masking_shadowing(cosine, cosine, surface.alpha.numpy())
     f0 = 0.04 + (surface.base_color.numpy() - 0.04) * surface.metallic.numpy()[:, None]
@@ -106,3 +106,33 @@ def test_an_interpolated_axis_is_normalised_and_a_vanished_one_is_replaced() -> 
     made = algorithm.unit_lobes(lobes)[0].numpy()
     np.testing.assert_allclose(made[0], [0.0, 0.6, 0.8, 0.0, 1.0, 0.0, 3.0], rtol=1e-6)
     np.testing.assert_allclose(made[1, :3], [0.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize("f0", [1.0, 0.04])
+def test_reflectance_is_the_single_scattering_albedo(f0: float) -> None:
+    """Within 3 % of quadrature for alpha 0.1 to 1, and a metal's and a dielectric's F0."""
+    cosines, alphas = np.meshgrid([0.05, 0.2, 0.5, 0.8, 1.0], [0.1, 0.2, 0.35, 0.5, 0.75, 1.0])
+    cosine, alpha = cosines.ravel(), alphas.ravel()
+    view = np.stack([np.sqrt(1.0 - cosine**2), np.zeros(30), cosine], axis=-1)
+    values = (np.tile([0.0, 0.0, 1.0], (30, 1)), view, np.ones((30, 3)), np.full(30, float(f0 == 1.0)), alpha)
+    found = algorithm.reflectance(algorithm.Surface(*(torch.from_numpy(value) for value in values))).numpy()
+    directions = fibonacci_sphere(400_000)
+    directions = directions[directions[:, 2] > 0.0]
+    for k in range(30):
+        half = unit(directions + view[k])
+        fresnel = ggx.fresnel_schlick(half @ view[k], f0)
+        shape = ggx.distribution(half[:, 2], alpha[k]) / (4.0 * cosine[k])
+        shape = shape * ggx.masking_shadowing(directions[:, 2], cosine[k], alpha[k])
+        expected = (fresnel * shape).sum() * 4.0 * np.pi / 400_000
+        np.testing.assert_allclose(found[k], expected, rtol=0.03)
+
+
+def test_what_passes_the_specular_layer() -> None:
+    """T is the cosine-weighted mean of 1 - F(o.h) over the hemisphere, within 0.002."""
+    directions = fibonacci_sphere(100_000)
+    directions = directions[directions[:, 2] > 0.0]
+    for cosine in (0.05, 0.3, 0.7, 1.0):
+        view = np.array([np.sqrt(1.0 - cosine**2), 0.0, cosine])
+        passes = 1.0 - ggx.fresnel_schlick(unit(directions + view) @ view, 0.04)
+        expected = (passes * directions[:, 2]).sum() * 4.0 / 100_000
+        assert float(algorithm.transmission(torch.tensor([cosine]))[0]) == pytest.approx(expected, abs=2e-3)

@@ -76,7 +76,8 @@ def test_u_near_a_small_sun_is_the_sum_over_the_image() -> None:
     near = directions[directions @ sun > 0.9]
     for layer, alpha in zip(layers, alphas, strict=True):
         cosine = near @ samples.direction.T
-        exact = np.where(cosine > 0.0, ggx.distribution(np.sqrt(0.5 * (1.0 + cosine)), alpha), 0.0) @ energy
+        weight = np.maximum(cosine, 0.0) * ggx.distribution(np.sqrt(0.5 * (1.0 + cosine)), alpha)
+        exact = weight @ energy / (weight @ samples.solid_angle[:, None]) * 4.0 / (1.0 + alpha**2)
         np.testing.assert_allclose(layer[directions @ sun > 0.9], exact, rtol=0.07)
 
 

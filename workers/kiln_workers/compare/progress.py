@@ -1,7 +1,8 @@
 """Progress of a comparison on the terminal: what is being done, how much is left, and about how long that takes.
 
 Work is measured in lobes times texels. How fast a solver gets through it is known once it has run with another number
-of lobes; until then the mean of the others stands in, and the estimate says that it is a guess.
+of lobes, and solvers differ by a factor of a thousand: so the estimate covers those that were timed and says how many
+were not.
 """
 
 import sys
@@ -29,14 +30,11 @@ class Estimate:
         if seconds is not None:
             self.rates.setdefault(solver, []).append(seconds / work)
 
-    def seconds(self) -> tuple[float, bool] | None:
-        """Seconds left, and whether the rates of all solvers are known; None before anything was measured."""
-        if not self.rates:
-            return None
+    def seconds(self) -> tuple[float, int]:
+        """Seconds left of the solvers that were timed, and how many others there are."""
         rate = {name: sum(values) / len(values) for name, values in self.rates.items()}
-        usual = sum(rate.values()) / len(rate)
-        total = sum(work * rate.get(solver, usual) for solver, work in self.left)
-        return total, all(solver in rate for solver, _ in self.left)
+        total = sum(work * rate.get(solver, 0.0) for solver, work in self.left)
+        return total, len({solver for solver, _ in self.left if solver not in rate})
 
 
 class Display:
@@ -94,9 +92,8 @@ class Display:
             self._bar.update(self._task, advance=advance, left=self._left().lstrip(", "), **fields)  # type: ignore[arg-type]
 
     def _left(self) -> str:
-        estimate = self._estimate.seconds()
-        if estimate is None or not self._estimate.left:
-            return ""
-        minutes, seconds = divmod(round(estimate[0]), 60)
-        guess = "" if estimate[1] else ", a guess: not every solver has run yet"
-        return f", about {minutes}:{seconds:02d} left{guess}"
+        left, untimed = self._estimate.seconds()
+        minutes, seconds = divmod(round(left), 60)
+        known = f", about {minutes}:{seconds:02d} left" if left > 0.0 else ""
+        others = f", {untimed} solver{'s' if untimed > 1 else ''} not timed yet" if untimed else ""
+        return known + others

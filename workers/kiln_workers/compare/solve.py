@@ -78,7 +78,7 @@ def kept(bench: Bench, solver: str, function: Solver, lobes: int) -> Solved | No
 
 def solve(bench: Bench, solver: str, function: Solver, lobes: int) -> Solved:
     """Run one solver, measure what it gives, and keep it."""
-    field, targets = bench.chosen.field, bench.targets
+    field, targets, key = bench.chosen.field, bench.targets, bench.key(solver, function, lobes)
     recorder = Recorder(field, targets)
     solution = function(field, lobes, on_epoch=recorder)
     made = solution.representation
@@ -106,7 +106,7 @@ def solve(bench: Bench, solver: str, function: Solver, lobes: int) -> Solved:
     )
     solved = Solved(row, made.rounded().parameters.numpy() if isinstance(made, Lobes) else None, _shown(bench, made))
     arrays = {"shown": solved.shown} | ({} if solved.lobes is None else {"lobes": solved.lobes})
-    bench.cache.save(KIND, bench.key(solver, function, lobes), row.model_dump(mode="json"), arrays)
+    bench.cache.save(KIND, key, row.model_dump(mode="json"), arrays)
     return solved
 
 

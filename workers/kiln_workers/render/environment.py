@@ -84,7 +84,11 @@ def octahedral_energy(samples: EnvironmentSamples, grid: int) -> Floats:
 def environment_u(
     environment: Environment, alphas: Floats, size: int, device: Device = "auto"
 ) -> tuple[Float32, Floats]:
-    """U(w, alpha) = integral of D(h) L over the hemisphere about w (light-field paper, eq. 6), not normalised.
+    """U(w, alpha) of the light-field paper (eq. 6), with w.l as a further weight, and the scale that eq. 6 has.
+
+    The mean of radiance under D(h) (w.l) for n = v = w, times the integral of D(h) over the hemisphere. Eq. 6 weights
+    with D alone, which is not zero at the edge of its hemisphere: a small sun that crosses it drew a hard line.
+    Constant light gives the same in both.
 
     Returns octahedral layers [A, size, size, 3] in world space (pixel layout of `conventions`) and the integrals of D
     alone [A], by which a layer has to be divided to become a mean of radiance.
@@ -92,7 +96,7 @@ def environment_u(
     select_variant(device)
     targets = octahedral.pixel_directions(size).reshape(-1, 3)
     integrals = lobes.ggx_integral(alphas)
-    means = np.stack([_filtered(environment, targets, float(alpha), cosine=False) for alpha in alphas])
+    means = np.stack([_filtered(environment, targets, float(alpha)) for alpha in alphas])
     return (means * integrals[:, None, None]).reshape(-1, size, size, 3).astype(np.float32), integrals
 
 
@@ -110,7 +114,7 @@ def ggx_prefilter(environment: Environment, size: int, mips: int, device: Device
         if mip == 0:
             levels.append(_cube_mirror(environment, side))
             continue
-        mean = _filtered(environment, cube_directions(side).reshape(-1, 3), float(roughness**2), cosine=True)
+        mean = _filtered(environment, cube_directions(side).reshape(-1, 3), float(roughness**2))
         levels.append(mean.reshape(6, side, side, 3).astype(np.float32))
     return levels
 
@@ -153,8 +157,8 @@ def _cube_mirror(environment: Environment, side: int) -> Float32:
     return np.asarray(total / density**2, dtype=np.float32)
 
 
-def _filtered(environment: Environment, targets: Floats, alpha: float, cosine: bool) -> Floats:
-    """Mean radiance [K, 3] under the lobes of width `alpha` about `targets` [K, 3]."""
+def _filtered(environment: Environment, targets: Floats, alpha: float) -> Floats:
+    """Mean radiance [K, 3] under D(h) (w.l) of the lobes of width `alpha` about `targets` [K, 3]."""
     grid = _grid_for(alpha)
     energy = octahedral_energy(environment_samples(environment, 16 * grid * grid), grid)
     sources = octahedral.pixel_directions(grid).reshape(-1, 3)
@@ -168,7 +172,6 @@ def _filtered(environment: Environment, targets: Floats, alpha: float, cosine: b
         dr.full(mi.UInt32, grid * grid, count),
         lobes.packed(sources),
         [lobes.packed(energy)],
-        cosine,
     )
     dr.eval(sums)
     out = np.stack([np.array(row[0]).T for row in sums], axis=1).reshape(-1, 4)

@@ -2,7 +2,9 @@
 
 A lobe with n = v = w has D(h) with h half-way between w and the light's direction l, so cos^2 theta_h = (1 + w.l) / 2
 and D(h) = alpha^2 / (pi t^2), t = ((1 + alpha^2) - (1 - alpha^2) w.l) / 2, on the hemisphere w.l > 0 (light-field
-paper, eq. 6). Over that hemisphere D integrates to 4 / (1 + alpha^2). Sources are pixels of an octahedral grid; a lobe
+paper, eq. 6). Over that hemisphere D integrates to 4 / (1 + alpha^2). Every sum has w.l as a further weight, which
+eq. 6 lacks: D ends at its hemisphere with a step, and a small sun that crosses it drew a hard line. Sources are pixels
+of an octahedral grid; a lobe
 is never taken narrower than the grid resolves. A lane sums its own targets in the order of the sources, so a result
 depends neither on the number of threads nor on what else is computed; the lobe is evaluated on the fly, which needs no
 table of kernels and takes every texel's own alpha.
@@ -40,13 +42,11 @@ def ggx_integral(alpha: Any) -> Any:
 
 
 @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
-def lobe_sums(
-    targets: list[Any], alpha: Any, first: Any, last: Any, axes: Any, values: list[Any], cosine: bool
-) -> list[list[Any]]:
-    """sum of D(h) value over sources first ... last - 1, for each target and each array of values.
+def lobe_sums(targets: list[Any], alpha: Any, first: Any, last: Any, axes: Any, values: list[Any]) -> list[list[Any]]:
+    """sum of D(h) (w.l) value over sources first ... last - 1, for each target w and each array of values.
 
     targets: Vector3f a lane, each; alpha: Float a lane; first, last: UInt32 a lane; axes: Float [S * 4] directions of
-    the sources, padded; values: Float [S * 4] each; cosine: weight with w.l as well. Returns [target][values] Vector4f.
+    the sources, padded; values: Float [S * 4] each. Returns [target][values] Vector4f.
     """
     width = dr.width(first)
     sums = [[dr.zeros(mi.Vector4f, width) for _ in values] for _ in targets]
@@ -60,8 +60,7 @@ def lobe_sums(
         for target in targets:
             across = target.x * axis.x + target.y * axis.y + target.z * axis.z
             t = outside - inside * across
-            weight = dr.select(across > 0.0, peak * dr.rcp(t * t), 0.0)
-            weights.append(weight * across if cosine else weight)
+            weights.append(dr.select(across > 0.0, peak * across * dr.rcp(t * t), 0.0))
         for k, array in enumerate(values):
             value = dr.gather(mi.Vector4f, array, source)
             for row, weight in zip(sums, weights, strict=True):

@@ -1,6 +1,6 @@
 """Illumination-weighted environment visibility W_E (light-field paper, eq. 7) from one traced visibility image a texel.
 
-    W_E(w) = sum_p D(h) Lbar_p V_p / sum_p D(h) Lbar_p        over the texel's upper hemisphere, three channels
+    W_E(w) = sum_p D(h) (w.p) Lbar_p V_p / sum_p D(h) (w.p) Lbar_p     over the texel's upper hemisphere, three channels
 
 Both sums are one quadrature over octahedral pixels p, so W_E is exactly 1 where nothing occludes. Lbar_p is the
 environment's energy in the pixel, every image pixel counted. V_p is traced with shadow rays that are distributed inside
@@ -150,7 +150,6 @@ def _convolved(
         mi.UInt32(last[owner].astype(np.uint32)),
         lobes.packed(octahedral.pixel_directions(grid).reshape(-1, 3)[source]),
         [lobes.packed(numerator), lobes.packed(denominator)],
-        False,
     )
     dr.eval(sums)
     out = np.empty((len(lanes), 3), np.float32)

@@ -46,7 +46,7 @@ def run_shade(options: argparse.Namespace) -> int:
     shape = (package.irradiance.shape[0], package.irradiance.shape[1])
     stored = None if options.stored is None else StoredImages.open(store_url(options.stored), shape)
     buffer = render_gbuffer(package.scene, camera, width, height, options.grid, options.device)
-    picture = shade(package, buffer, terms, stored)
+    picture = shade(package, buffer, terms, stored, options.paper)
     white = options.white or colour.white_point(picture if against is None else against)
     write_picture(out, picture, white)
     told: dict[str, Any] = {
@@ -54,6 +54,7 @@ def run_shade(options: argparse.Namespace) -> int:
         "width": width,
         "height": height,
         "terms": [str(term) for term in terms],
+        "paper": options.paper,
         "source": "textures" if stored is None else "store",
         "white": white,
         "seconds": round(time.perf_counter() - began, 3),

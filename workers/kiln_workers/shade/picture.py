@@ -18,9 +18,16 @@ POINTS_AT_ONCE: Final = 1 << 16
 
 
 def shade(
-    package: ShadePackage, buffer: GBuffer, terms: Collection[Term] = WHOLE, incident: Incident | None = None
+    package: ShadePackage,
+    buffer: GBuffer,
+    terms: Collection[Term] = WHOLE,
+    incident: Incident | None = None,
+    paper: bool = False,
 ) -> Float32:
-    """Radiance [H, W, 3], the sum of `terms`; glossy light from `incident`, by default the package's lobes."""
+    """Radiance [H, W, 3], the sum of `terms`; glossy light from `incident`, by default the package's lobes.
+
+    `paper`: F and G at the specular direction, as the paper has them, instead of the albedo of GGX.
+    """
     height, width, samples = buffer.hit.shape
     out = np.zeros((height * width * samples, 3), np.float32)
     hit = buffer.hit.ravel()
@@ -29,7 +36,7 @@ def shade(
     at_once = POINTS_AT_ONCE if incident is None else max(len(buffer), 1)
     for start in range(0, len(buffer), at_once):
         part = slice(start, start + at_once)
-        surfaces[part] = _shade_points(package, buffer, part, terms, incident or package.lobes)
+        surfaces[part] = _shade_points(package, buffer, part, terms, incident or package.lobes, paper)
     out[hit] = surfaces
     if Term.BACKGROUND in terms and package.environment is not None and not hit.all():
         directions = _tensor(buffer.directions.reshape(-1, 3)[~hit], package.irradiance)
@@ -38,7 +45,7 @@ def shade(
 
 
 def _shade_points(
-    package: ShadePackage, buffer: GBuffer, part: slice, terms: Collection[Term], incident: Incident
+    package: ShadePackage, buffer: GBuffer, part: slice, terms: Collection[Term], incident: Incident, paper: bool
 ) -> Float32:
     """Radiance [P, 3] of some of the G-buffer's points."""
     like = package.irradiance
@@ -50,13 +57,16 @@ def _shade_points(
         metallic=_tensor(buffer.metallic[part], like),
         alpha=_tensor(buffer.alpha[part], like),
     )
-    glossy = torch.zeros_like(surface.normal)
+    # What is under D is either the paper's integral, or a mean.
+    factor = algorithm.paper_factor(surface) if paper else algorithm.reflectance(surface)
+    radiance = torch.zeros_like(surface.normal)
     if Term.INTERREFLECTION in terms:
-        glossy += incident.reflected(uv, surface)
+        scale = 1.0 if paper else 0.25 / surface.cosine[:, None]
+        radiance += incident.reflected(uv, surface) * scale * factor
     if package.environment is not None and (Term.ENVIRONMENT in terms or Term.UNOCCLUDED in terms):
         u = package.environment.convolved(surface.specular, surface.alpha)
-        glossy += u * incident.visibility(uv, surface) if Term.ENVIRONMENT in terms else u
-    radiance = glossy * algorithm.specular_factor(surface)
+        seen = incident.visibility(uv, surface) if Term.ENVIRONMENT in terms else 1.0
+        radiance += u * seen * (1.0 if paper else algorithm.mean_scale(surface)) * factor
     if Term.DIFFUSE in terms:
         radiance += algorithm.diffuse(surface, textures.bilinear(package.irradiance, uv))
     radiance *= _tensor(buffer.reflects[part].astype(np.float32), like)[:, None]

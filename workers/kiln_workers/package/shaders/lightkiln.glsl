@@ -28,31 +28,28 @@ vec3 lkLobeSum(sampler2DArray lobes, int count, vec2 uv, vec3 direction) {
   return sum;
 }
 
-// Fresnel reflectance (Schlick 1994).
-vec3 lkFresnel(vec3 f0, float cosine) {
-  float x = clamp(1.0 - cosine, 0.0, 1.0);
-  float x2 = x * x;
-  return f0 + (1.0 - f0) * (x2 * x2 * x);
-}
-
-// Smith's masking and shadowing for GGX with correlated heights (Heitz 2014, eq. 99), at equal elevations of both
-// directions, as the specular direction has: 1 / (1 + 2 Lambda).
-float lkMasking(float alpha, float cosine) {
-  float c2 = cosine * cosine;
-  return 1.0 / sqrt(1.0 + alpha * alpha * (1.0 - c2) / max(c2, 1e-8));
-}
-
 // Reflectance at normal incidence of a glTF metallic-roughness surface.
 vec3 lkF0(LkSurface surface) {
   return mix(vec3(0.04), surface.baseColor, surface.metallic);
 }
 
-// F G / (4 |o.n|): the rest of the microfacet model, taken at the specular direction (eq. 4, step 5 of section 6); its
-// |r.n| cancels against the cosine of the rendering equation.
-vec3 lkSpecularFactor(LkSurface surface, vec3 o) {
-  float cosine = max(dot(surface.normal, o), 1e-4);
-  float alpha = surface.roughness * surface.roughness;
-  return lkFresnel(lkF0(surface), cosine) * lkMasking(alpha, cosine) / (4.0 * cosine);
+// The single-scattering albedo of GGX: the integral over i of D G F / (4 n.o), F0 A + B with A and B rational in o.n
+// and alpha (the form of MaterialX' mx_ggx_dir_albedo_analytic, coefficients our own; within 2 % for alpha 0.04 to 1).
+// The paper takes F and G at the specular direction instead (step 5 of section 6), which loses up to half of the light.
+vec3 lkReflectance(LkSurface surface, vec3 o) {
+  float x = clamp(dot(surface.normal, o), 1e-4, 1.0);
+  float y = max(surface.roughness * surface.roughness, 0.04);
+  vec4 fit = vec4(0.079654, 0.82584, 1.0, 1.0);
+  fit += vec4(-2.112, -1.9157, -2.3351, -2.4264) * (x);
+  fit += vec4(10.725, 0.021977, 9.5778, 10.771) * (y);
+  fit += vec4(-5.696, 0.58532, 0.54603, -6.4866) * (x * y);
+  fit += vec4(40.966, 1.088, 39.229, 18.855) * (x * x);
+  fit += vec4(-8.8396, 0.14768, -8.5177, 11.302) * (y * y);
+  fit += vec4(-40.58, -0.52883, -36.547, -51.571) * (x * x * y);
+  fit += vec4(24.516, -0.68548, 28.513, 105.32) * (x * y * y);
+  fit += vec4(-2.1546, 0.42731, 23.074, 52.019) * (x * x * y * y);
+  vec2 ab = clamp(fit.xy / fit.zw, 0.0, 1.0);
+  return lkF0(surface) * ab.x + ab.y;
 }
 
 // Glossy reflection of the scene: each lobe of the light field convolved with D (steps 3 to 6 of section 6).
@@ -60,29 +57,29 @@ vec3 lkInterreflection(sampler2DArray lightField, int count, vec2 uv, LkSurface 
   LkAnisotropicLobe kernel = lkReflectionLobe(surface.normal, o, surface.roughness * surface.roughness);
   vec3 sum = vec3(0.0);
   for (int k = 0; k < count; k++) sum += lkConvolve(lkFetchLobe(lightField, uv, k), kernel);
-  return sum * lkSpecularFactor(surface, o);
+  // The kernel integrates to 4 (o.n): the quotient is a mean.
+  return sum / (4.0 * max(dot(surface.normal, o), 1e-4)) * lkReflectance(surface, o);
 }
 
-// Glossy reflection of the environment: U times its visibility times the rest (eq. 8). u is lkEnvironmentU at the
-// specular direction.
+// Glossy reflection of the environment: U over the integral of D, 4 / (1 + alpha^2), times visibility and albedo (eq. 8).
+// u is lkEnvironmentU at the specular direction.
 vec3 lkEnvironmentReflection(sampler2DArray visibility, int count, vec2 uv, LkSurface surface, vec3 o, vec3 u) {
   vec3 specular = reflect(-o, surface.normal);
-  return u * lkLobeSum(visibility, count, uv, specular) * lkSpecularFactor(surface, o);
+  float alpha = surface.roughness * surface.roughness;
+  vec3 mean = u * (0.25 * (1.0 + alpha * alpha));
+  return mean * lkLobeSum(visibility, count, uv, specular) * lkReflectance(surface, o);
 }
 
-// The same from the GGX cube map, whose mips are normalised means: split sum with Karis' fit of the second factor
-// (Karis 2014, "Physically Based Shading on Mobile"). mean is lkEnvironmentGgx at the specular direction.
+// The same from the GGX cube map, whose mips are means. mean is lkEnvironmentGgx at the specular direction.
 vec3 lkEnvironmentSplitSum(sampler2DArray visibility, int count, vec2 uv, LkSurface surface, vec3 o, vec3 mean) {
-  float cosine = clamp(dot(surface.normal, o), 0.0, 1.0);
-  vec4 r = surface.roughness * vec4(-1.0, -0.0275, -0.572, 0.022) + vec4(1.0, 0.0425, 1.04, -0.04);
-  float a = min(r.x * r.x, exp2(-9.28 * cosine)) * r.x + r.y;
-  vec2 scaleBias = vec2(-1.04, 1.04) * a + r.zw;
   vec3 specular = reflect(-o, surface.normal);
-  return mean * lkLobeSum(visibility, count, uv, specular) * (lkF0(surface) * scaleBias.x + scaleBias.y);
+  return mean * lkLobeSum(visibility, count, uv, specular) * lkReflectance(surface, o);
 }
 
-// Diffuse reflection of the baked irradiance (W/m^2), without what the specular layer reflects.
+// Diffuse reflection of the baked irradiance (W/m^2), without what the specular layer reflects: 1 - F(o.h) averaged over
+// the hemisphere is 0.959 - 0.0266 (1 - o.n)^3 within 0.001.
 vec3 lkDiffuse(sampler2D irradiance, vec2 uv, LkSurface surface, vec3 o) {
-  vec3 transmitted = 1.0 - lkFresnel(vec3(0.04), max(dot(surface.normal, o), 0.0));
+  float away = 1.0 - clamp(dot(surface.normal, o), 0.0, 1.0);
+  float transmitted = 0.95903 - 0.02659 * away * away * away;
   return texture(irradiance, uv).rgb * surface.baseColor * (1.0 - surface.metallic) * transmitted / LK_PI;
 }
