@@ -61,7 +61,7 @@ class RenderSettings(Contract):
     between_samples: int = Field(
         default=64, ge=0, le=65536, description="paths per pixel of the sparse light fields between texels; 0: none"
     )
-    max_depth: int = Field(default=6, ge=1, le=64, description="scattering events on a path, at most")
+    max_depth: int = Field(default=6, ge=0, le=64, description="scattering events on a path, at most")
 
     @field_validator("image_size")
     @classmethod

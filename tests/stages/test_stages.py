@@ -1,9 +1,8 @@
 """The stages in one process, on a room: what the package's textures hold is what the fit gave."""
 
-import hashlib
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,6 +12,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 from e2e_farm import TINY, room, sky
+from in_process import MemoryContext
 
 from kiln_schemas.camera import Camera
 from kiln_schemas.errors import Canceled, InputError
@@ -56,47 +56,6 @@ from kiln_workers.store.light_field import LightFieldStore
 FRONT = Camera(position=(0.3, 1.1, 3.6), target=(0.0, 0.9, -0.5), fov_deg=45)
 GATES = Gates(log_mse_rel=1e-6, visibility_log_mse_rel=0.5, flip={"front": 0.6})
 """One that is missed and two that are met; the loose one makes do with few paths."""
-
-
-@dataclass
-class MemoryContext:
-    """A `runner.context.Context` without a coordinator."""
-
-    scratch: Path
-    blobs: dict[str, bytes] = field(default_factory=dict)
-    cache: dict[str, Any] = field(default_factory=dict)
-    memory_bytes: int = 1 << 30
-    threads: int = 2
-    canceled: bool = False
-    messages: list[str] = field(default_factory=list)
-
-    def blob(self, sha256: str) -> bytes:
-        return self.blobs[sha256]
-
-    def blob_path(self, sha256: str) -> Path:
-        path = self.scratch / sha256
-        path.write_bytes(self.blobs[sha256])
-        return path
-
-    def put_blob(self, data: bytes | Path) -> str:
-        content = data if isinstance(data, bytes) else data.read_bytes()
-        sha256 = hashlib.sha256(content).hexdigest()
-        self.blobs[sha256] = content
-        return sha256
-
-    def progress(self, done: float, total: float, unit: str, message: str = "", loss: float | None = None) -> None:
-        assert 0 <= done <= total
-        if self.canceled:
-            raise Canceled("the task is no longer wanted")
-
-    def checkpoint(self, data: bytes) -> None:
-        self.put_blob(data)
-
-    def last_checkpoint(self) -> bytes | None:
-        return None
-
-    def log(self, text: str) -> None:
-        self.messages.append(text)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ class GBuffer:
     alpha: Float32  # [P] GGX width
     emission: Float32  # [P, 3] radiance towards the eye
     reflects: Bools  # [P] False on the back of a single-sided surface, which is black
+    specular_escapes: Bools  # [P] whether the ray in the specular direction leaves the scene
 
     def __len__(self) -> int:
         return len(self.position)
@@ -69,7 +70,7 @@ def render_gbuffer(
     table[identifiers] = [mesh_number(shape) for shape in shapes]
     mesh = table[np.array(dr.reinterpret_array(mi.UInt32, si.shape))[hit]]
     surface = _interpolated(scene, mesh, np.array(si.prim_index)[hit].astype(np.int64), np.array(si.p).T[hit])
-    return _gbuffer(scene, directions, hit, mesh, surface)
+    return _gbuffer(scene, directions, hit, mesh, surface, tracer)
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,10 @@ def barycentric(mesh: Mesh, corners: npt.NDArray[np.int32], points: Floats) -> t
     return weights, normal / np.sqrt(square)[:, None]
 
 
-def _gbuffer(scene: Scene, directions: Float32, hit: Bools, mesh: Ints, surface: _Vertices) -> GBuffer:
-    """Materials added, and normals turned to the eye."""
+def _gbuffer(
+    scene: Scene, directions: Float32, hit: Bools, mesh: Ints, surface: _Vertices, tracer: PathTracer
+) -> GBuffer:
+    """Materials added, normals turned to the eye, the specular direction followed."""
     materials = np.array([one.material for one in scene.meshes], np.int64)[mesh]
     reflectance = material.evaluate(scene, materials, surface.uv)
     view = -directions.reshape(-1, 3)[hit]
@@ -137,4 +140,15 @@ def _gbuffer(scene: Scene, directions: Float32, hit: Bools, mesh: Ints, surface:
         alpha=np.square(reflectance.roughness),
         emission=np.where(seen[:, None], reflectance.emission, 0.0).astype(np.float32),
         reflects=seen,
+        specular_escapes=_escapes(tracer, surface.position, face_normal, normal, view),
     )
+
+
+def _escapes(tracer: PathTracer, position: Floats, face_normal: Floats, normal: Floats, view: Float32) -> Bools:
+    """Whether rays from points [P, 3] in their specular directions leave the scene; never into the surface itself."""
+    specular = 2.0 * np.einsum("pc,pc->p", normal, view)[:, None] * normal - view
+    p, n, d = (np.ascontiguousarray(values.T.astype(np.float32)) for values in (position, face_normal, specular))
+    direction = mi.Vector3f(d)
+    ray = mi.Ray3f(tracer.leave(mi.Point3f(p), mi.Normal3f(n), direction), direction)
+    above = dr.dot(mi.Normal3f(n), direction) > 0.0
+    return np.array(above & ~tracer.blocked(ray, above)).astype(bool)

@@ -12,7 +12,7 @@ from kiln_workers.scene.model import Float32
 from kiln_workers.shade import algorithm, textures
 from kiln_workers.shade.gbuffer import GBuffer
 from kiln_workers.shade.package import Incident, ShadePackage
-from kiln_workers.shade.term import WHOLE, Term
+from kiln_workers.shade.term import COMPARED, WHOLE, Term
 
 POINTS_AT_ONCE: Final = 1 << 16
 
@@ -63,9 +63,14 @@ def _shade_points(
     if Term.INTERREFLECTION in terms:
         scale = 1.0 if paper else 0.25 / surface.cosine[:, None]
         radiance += incident.reflected(uv, surface) * scale * factor
-    if package.environment is not None and (Term.ENVIRONMENT in terms or Term.UNOCCLUDED in terms):
+    reflected = {Term.ENVIRONMENT, *COMPARED} & set(terms)
+    if package.environment is not None and reflected:
         u = package.environment.convolved(surface.specular, surface.alpha)
-        seen = incident.visibility(uv, surface) if Term.ENVIRONMENT in terms else 1.0
+        seen: Tensor | float = 1.0
+        if Term.ENVIRONMENT in reflected:
+            seen = incident.visibility(uv, surface)
+        elif Term.MIRROR_VISIBILITY in reflected:
+            seen = _tensor(buffer.specular_escapes[part].astype(np.float32), like)[:, None]
         radiance += u * seen * (1.0 if paper else algorithm.mean_scale(surface)) * factor
     if Term.DIFFUSE in terms:
         radiance += algorithm.diffuse(surface, textures.bilinear(package.irradiance, uv))

@@ -5,7 +5,7 @@ from typing import Final
 
 
 class Term(StrEnum):
-    """A part of a picture; the default picture is the sum of all but UNOCCLUDED."""
+    """A part of a picture; the default picture is the sum of WHOLE."""
 
     EMISSION = "emission"
     """What surfaces emit themselves."""
@@ -17,8 +17,13 @@ class Term(StrEnum):
     """Glossy reflection of the environment: U W_E (eq. 8)."""
     UNOCCLUDED = "unoccluded"
     """The same without visibility: U alone (eq. 4), for comparison."""
+    MIRROR_VISIBILITY = "mirror-visibility"
+    """U where the specular ray leaves the scene (the paper's figure 4, which leaks), for comparison."""
     BACKGROUND = "background"
     """The environment where no surface is."""
 
 
-WHOLE: Final = tuple(term for term in Term if term is not Term.UNOCCLUDED)
+COMPARED: Final = (Term.UNOCCLUDED, Term.MIRROR_VISIBILITY)
+"""What may stand in the place of ENVIRONMENT, to see what W_E does."""
+
+WHOLE: Final = tuple(term for term in Term if term not in COMPARED)

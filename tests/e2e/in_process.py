@@ -1,0 +1,106 @@
+"""A whole bake in one process, by the real stages, without a coordinator."""
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from kiln_schemas.errors import Canceled
+from kiln_schemas.settings import BakeSettings, Function
+from kiln_schemas.tasks import (
+    Bundle,
+    EnvironmentRef,
+    FitPayload,
+    PackagePayload,
+    PreparePayload,
+    RefinePayload,
+    RenderPayload,
+)
+from kiln_service.planner import plan_blocks
+from kiln_workers.package.glb import encode_glb
+from kiln_workers.scene.examples import write_exr
+from kiln_workers.scene.model import Scene
+from kiln_workers.stages import fit, package, prepare, refine, render
+
+
+@dataclass
+class MemoryContext:
+    """A `runner.context.Context` without a coordinator."""
+
+    scratch: Path
+    blobs: dict[str, bytes] = field(default_factory=dict)
+    cache: dict[str, Any] = field(default_factory=dict)
+    memory_bytes: int = 1 << 30
+    threads: int = 2
+    canceled: bool = False
+    messages: list[str] = field(default_factory=list)
+
+    def blob(self, sha256: str) -> bytes:
+        return self.blobs[sha256]
+
+    def blob_path(self, sha256: str) -> Path:
+        path = self.scratch / sha256
+        path.write_bytes(self.blobs[sha256])
+        return path
+
+    def put_blob(self, data: bytes | Path) -> str:
+        content = data if isinstance(data, bytes) else data.read_bytes()
+        sha256 = hashlib.sha256(content).hexdigest()
+        self.blobs[sha256] = content
+        return sha256
+
+    def progress(self, done: float, total: float, unit: str, message: str = "", loss: float | None = None) -> None:
+        assert 0 <= done <= total
+        if self.canceled:
+            raise Canceled("the task is no longer wanted")
+
+    def checkpoint(self, data: bytes) -> None:
+        self.put_blob(data)
+
+    def last_checkpoint(self) -> bytes | None:
+        return None
+
+    def log(self, text: str) -> None:
+        self.messages.append(text)
+
+
+def bake(folder: Path, scene: Scene, settings: BakeSettings) -> Path:
+    """Bake a scene into `folder`; the package's folder. The store is `folder / "store.zarr"`."""
+    context = MemoryContext(scratch=folder / "scratch")
+    context.scratch.mkdir(parents=True)
+    files, environment = {"scene.glb": context.put_blob(encode_glb(scene))}, None
+    if scene.environment is not None:
+        write_exr(folder / "sky.exr", scene.environment.pixels)
+        files["sky.exr"] = context.put_blob(folder / "sky.exr")
+        environment = EnvironmentRef(file="sky.exr")
+    bundle = Bundle(entry="scene.glb", files=files, environment=environment)
+    common: dict[str, Any] = {"settings": settings, "store_url": (folder / "store.zarr").absolute().as_uri()}
+    prepared = prepare.run(PreparePayload(bundle=bundle, **common), context)
+    maps: dict[str, Any] = {"texel_map": prepared.texel_map, **common}
+    placed: dict[str, Any] = {"between": prepared.between, **maps}
+    renders = tuple(
+        render.run(RenderPayload(scene=prepared.scene, tile=tile, **placed), context) for tile in prepared.tiles
+    )
+    functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if environment else [])
+    fits = tuple(fit.run(FitPayload(function=f, renders=renders, **maps), context) for f in functions)
+    refines = tuple(
+        refine.run(RefinePayload(block=block, renders=renders, fit=fits[0], **placed), context)
+        for block in plan_blocks(prepared.tiles, settings)
+    )
+    packaged = package.run(
+        PackagePayload(
+            job_id="0" * 32,
+            job_name="test",
+            bundle=bundle,
+            prepare=prepared,
+            renders=renders,
+            fits=fits,
+            refines=refines,
+            **common,
+        ),
+        context,
+    )
+    for artifact in packaged.artifacts:
+        (folder / "package" / artifact.name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "package" / artifact.name).write_bytes(context.blobs[artifact.sha256])
+    return folder / "package"
