@@ -25,6 +25,7 @@ from kiln_workers.runner.machine import cores, default_memory_bytes, parse_size
 from kiln_workers.shade import command as shading
 
 INTERRUPTED: Final = 130
+OURS: Final = "coherent"
 NETWORK: Final = "cnn"
 """The solver whose convergence figures 6 and 8 show."""
 
@@ -36,8 +37,10 @@ def run_compare(options: argparse.Namespace) -> int:
     threads = options.threads or cores()
     width, height = shading.parse_size(options.size)
     subject = open_subject(options.subject, options.package, options.store, options.env)
-    # The network is trained as the bake trains it; the other solvers do not depend on the job.
-    known: dict[str, Solver] = {**SOLVERS, NETWORK: partial(SOLVERS[NETWORK], settings=subject.settings.fit)}
+    # Ours and the network do as the bake does; the other solvers do not depend on the job.
+    known: dict[str, Solver] = dict(SOLVERS)
+    for name in (OURS, NETWORK):
+        known[name] = partial(SOLVERS[name], settings=subject.settings.fit)
     plan = Plan(
         out=_made(options.out),
         solvers=chosen_solvers(options.solvers, known),

@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kiln_schemas.settings import FitSettings
 from kiln_workers.fit.field import TexelField, TracedBetween
 from kiln_workers.fit.lobes import constrain
 from kiln_workers.fit.metrics import horizon_weights
@@ -33,7 +34,7 @@ from kiln_workers.fit.network import pixel_centres
 from kiln_workers.fit.optimizer import BETA_1, BETA_2, one_cycle
 from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, mixed_lobes, nobody
 from kiln_workers.fit.solvers.alignment import Neighbourhood
-from kiln_workers.fit.solvers.encoder import cnn
+from kiln_workers.fit.solvers.encoder import SETTINGS, cnn
 from kiln_workers.fit.solvers.losses import texel_losses
 from kiln_workers.fit.solvers.pixels import Pixels, gather
 from kiln_workers.fit.solvers.starts import unconstrain
@@ -67,27 +68,21 @@ def coherent(
     lobes: int,
     on_epoch: OnEpoch = nobody,
     *,
-    start: Tensor | None = None,
-    options: CoherentOptions = CoherentOptions(),
+    settings: FitSettings = SETTINGS,
     seed: int = 0,
 ) -> Solution:
-    """From exposure-normalised lobes `start` [T, N, 7]; without, the network is trained on the field first.
-
-    Epochs and seconds are then those of both together.
-    """
-    watch, before = Stopwatch(on_epoch), 0
-    if start is None:
-        trained = cnn(field, lobes, on_epoch, seed=seed)
-        start, before = trained.representation.parameters, trained.epochs
-    done = before
+    """The network trained on the field, then `settings.refine_steps` of the descent; epochs and seconds of both."""
+    trained = cnn(field, lobes, on_epoch, settings=settings, seed=seed)
+    watch = Stopwatch(on_epoch)
+    normals = torch.from_numpy(field.normals)
 
     def tell(step: int, raw: Tensor) -> None:
-        nonlocal done
-        done = before + step
-        watch.tell(done, lambda: Lobes(constrain(raw, torch.from_numpy(field.normals))))
+        watch.tell(trained.epochs + step, lambda: Lobes(constrain(raw, normals)))
 
+    options = CoherentOptions(steps=settings.refine_steps)
+    start = trained.representation.parameters
     found = descend(field, start, options, seed, threads=torch.get_num_threads(), on_step=tell)
-    return Solution(Lobes(found), done, watch.seconds)
+    return Solution(Lobes(found), trained.epochs + options.steps, trained.seconds + watch.seconds)
 
 
 def descend(
