@@ -16,9 +16,7 @@ def add_commands(commands: Any) -> None:
     shading.add_argument("--grid", type=_positive, default=2, help="N x N samples a pixel")
     shading.add_argument("--terms", default=",".join(WHOLE), help=f"some of {','.join(Term)}")
     shading.add_argument("--stored", help="light-field store to take the light from instead of the lobes")
-    shading.add_argument(
-        "--paper", action="store_true", help="F and G at the specular direction, as the paper has them"
-    )
+    shading.add_argument("--paper", action="store_true", help="D, F and G as the paper has them, for comparison")
     shading.add_argument(
         "--against", type=Path, help="EXR of the same camera to measure PSNR, SSIM and HDR-FLIP against"
     )

@@ -39,8 +39,8 @@ Float32 = npt.NDArray[np.float32]
 class Incident(Protocol):
     """The light that arrives at P points of the light map: uv [P, 2]."""
 
-    def reflected(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
-        """Integral of the light field times D [P, 3]."""
+    def reflected(self, uv: Tensor, surface: algorithm.Surface, paper: bool = False) -> Tensor:
+        """Mean of the light field under the surface's kernel [P, 3]; `paper`: its integral times D."""
         ...
 
     def visibility(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
@@ -55,9 +55,11 @@ class LobeTextures:
     light_field: Tensor  # [H, W, N, 7]
     visibility_lobes: Tensor | None  # [H, W, N, 7]; None without an environment
 
-    def reflected(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
+    def reflected(self, uv: Tensor, surface: algorithm.Surface, paper: bool = False) -> Tensor:
         lobes = algorithm.unit_lobes(textures.bilinear(self.light_field, uv))
-        return algorithm.convolved(lobes, algorithm.reflection_kernel(surface))
+        if paper:
+            return algorithm.convolved(lobes, algorithm.paper_kernel(surface))
+        return algorithm.mean_under(lobes, algorithm.reflection_kernel(surface))
 
     def visibility(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
         if self.visibility_lobes is None:

@@ -26,7 +26,7 @@ def shade(
 ) -> Float32:
     """Radiance [H, W, 3], the sum of `terms`; glossy light from `incident`, by default the package's lobes.
 
-    `paper`: F and G at the specular direction, as the paper has them, instead of the albedo of GGX.
+    `paper`: D, F and G as the paper has them, instead of a fitted kernel and the albedo of GGX.
     """
     height, width, samples = buffer.hit.shape
     out = np.zeros((height * width * samples, 3), np.float32)
@@ -57,12 +57,10 @@ def _shade_points(
         metallic=_tensor(buffer.metallic[part], like),
         alpha=_tensor(buffer.alpha[part], like),
     )
-    # What is under D is either the paper's integral, or a mean.
     factor = algorithm.paper_factor(surface) if paper else algorithm.reflectance(surface)
     radiance = torch.zeros_like(surface.normal)
     if Term.INTERREFLECTION in terms:
-        scale = 1.0 if paper else 0.25 / surface.cosine[:, None]
-        radiance += incident.reflected(uv, surface) * scale * factor
+        radiance += incident.reflected(uv, surface, paper) * factor
     reflected = {Term.ENVIRONMENT, *COMPARED} & set(terms)
     if package.environment is not None and reflected:
         u = package.environment.convolved(surface.specular, surface.alpha)

@@ -45,8 +45,8 @@ class StoredImages:
             )
         return cls(store, store.read_texel_map()["state"] == VALID)
 
-    def reflected(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
-        kernel = algorithm.reflection_kernel(surface)
+    def reflected(self, uv: Tensor, surface: algorithm.Surface, paper: bool = False) -> Tensor:
+        kernel = algorithm.paper_kernel(surface) if paper else algorithm.reflection_kernel(surface)
         size = self.store.image_size
         directions = torch.from_numpy(octahedral.pixel_directions(size).reshape(-1, 3)).to(uv)
         solid_angles = torch.from_numpy(octahedral.pixel_solid_angles(size).reshape(-1, 1).copy()).to(uv)

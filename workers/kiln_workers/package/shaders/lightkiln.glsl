@@ -57,8 +57,7 @@ vec3 lkInterreflection(sampler2DArray lightField, int count, vec2 uv, LkSurface 
   LkAnisotropicLobe kernel = lkReflectionLobe(surface.normal, o, surface.roughness * surface.roughness);
   vec3 sum = vec3(0.0);
   for (int k = 0; k < count; k++) sum += lkConvolve(lkFetchLobe(lightField, uv, k), kernel);
-  // The kernel integrates to 4 (o.n): the quotient is a mean.
-  return sum / (4.0 * max(dot(surface.normal, o), 1e-4)) * lkReflectance(surface, o);
+  return sum * lkReflectance(surface, o);
 }
 
 // Glossy reflection of the environment: U over the integral of D, 4 / (1 + alpha^2), times visibility and albedo (eq. 8).

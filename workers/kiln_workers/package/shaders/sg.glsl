@@ -48,33 +48,60 @@ vec3 lkProductIntegral(LkLobe a, LkLobe b) {
   return a.amplitude * b.amplitude * lkIntegral(m) * exp(m - a.sharpness - b.sharpness);
 }
 
-// The normal distribution D(h) about the normal n for GGX width alpha, as a function of the incoming direction, seen
-// from the unit direction o (eq. 17 and 18; Wang et al. 2009). x is perpendicular to the plane of incidence, where
-// the lobe narrows towards grazing angles.
+// (1 - exp(-s)) / s, 1 at s = 0.
+float lkSaturated(float s) {
+  // Below 0.01 the difference cancels in 32 bits.
+  return s < 0.01 ? 1.0 - 0.5 * s : (1.0 - exp(-s)) / s;
+}
+
+// Integral over the sphere of max(v.z, 0) exp(-s.x (v.x)^2 - s.y (v.y)^2); exact where both sharpnesses agree.
+float lkCap(vec2 s) {
+  return LK_PI * sqrt(lkSaturated(s.x) * lkSaturated(s.y));
+}
+
+// What a GGX surface of width alpha gathers light with, D G (n.i), seen from the unit direction o: an anisotropic
+// Gaussian whose integral is 1. Its axis leaves the specular direction for the normal as alpha grows and the view
+// lowers; tilt and sharpnesses are polynomials in o.n and alpha, fitted to the microfacet model. The paper's eq. 17 and
+// 18 (Wang et al. 2009) hold for smooth surfaces seen from above only. x is perpendicular to the plane of incidence.
 LkAnisotropicLobe lkReflectionLobe(vec3 n, vec3 o, float alpha) {
-  float cosine = max(dot(n, o), 1e-4);
-  float width = max(alpha * alpha, 1e-6);
+  float x = clamp(dot(n, o), 1e-4, 1.0);
+  float y = clamp(alpha, 0.04, 1.0);
+  vec3 fit = vec3(2.2033, 2.8916, -0.97613);
+  fit += vec3(-5.7166, -5.0691, 0.7319) * (y);
+  fit += vec3(3.9747, -3.1406, 0.98899) * (x);
+  fit += vec3(-3.3405, -3.5273, -2.3086) * (y * y);
+  fit += vec3(-3.3991, 7.2016, 2.8365) * (y * x);
+  fit += vec3(0.99922, -1.4864, -0.35477) * (x * x);
+  fit += vec3(-2.101, -2.7828, -6.2307) * (y * y * y);
+  fit += vec3(-1.6886, 2.7302, -1.9223) * (y * y * x);
+  fit += vec3(-2.9847, 1.3919, 1.5315) * (y * x * x);
+  fit += vec3(-0.4911, 0.63876, -0.85262) * (x * x * x);
+  vec3 specular = 2.0 * dot(n, o) * n - o;
   LkAnisotropicLobe lobe;
-  lobe.z = normalize(2.0 * dot(n, o) * n - o);
+  lobe.z = normalize(mix(n, specular, 1.0 / (1.0 + exp(-fit.x))));
   // Looking along the normal both sharpnesses agree, and any frame about z will do.
-  vec3 across = cross(n, lobe.z);
-  vec3 other = abs(lobe.z.y) < 0.9 ? vec3(0.0, 1.0, 0.0) : vec3(1.0, 0.0, 0.0);
-  lobe.x = normalize(dot(across, across) > 1e-10 ? across : cross(other, lobe.z));
+  vec3 across = cross(n, specular);
+  vec3 other = abs(specular.y) < 0.9 ? vec3(0.0, 1.0, 0.0) : vec3(1.0, 0.0, 0.0);
+  lobe.x = normalize(dot(across, across) > 1e-10 ? across : cross(other, specular));
   lobe.y = cross(lobe.z, lobe.x);
-  lobe.sharpness = (2.0 / width) / 8.0 * vec2(1.0 / (cosine * cosine), 1.0);
-  lobe.amplitude = 1.0 / (LK_PI * width);
+  lobe.sharpness = exp(fit.yz) / (4.0 * y * y);
+  lobe.amplitude = 1.0 / lkCap(lobe.sharpness);
   return lobe;
 }
 
-// Integral over the sphere of a lobe times an anisotropic lobe (eq. 24, corrected: the Gaussian is evaluated at the
-// lobe's axis with the reduced sharpnesses nu s / (nu + s), nu = sharpness / 2).
+// Integral over the sphere of a lobe times an anisotropic lobe: eq. 24, corrected (the Gaussian is evaluated at the lobe's
+// axis with the reduced sharpnesses nu s / (nu + s), nu = sharpness / 2) and made sound for wide lobes: distances are
+// chords, the cosine is taken at the product's centre, and the hemisphere about it is what is integrated over.
 vec3 lkConvolve(LkLobe lobe, LkAnisotropicLobe kernel) {
   float nu = 0.5 * lobe.sharpness;
   vec2 sum = nu + kernel.sharpness;
   vec2 reduced = nu * kernel.sharpness / sum;
   float x = dot(lobe.axis, kernel.x);
   float y = dot(lobe.axis, kernel.y);
-  float z = max(dot(lobe.axis, kernel.z), 0.0);
-  float overlap = LK_PI * inversesqrt(sum.x * sum.y) * z * exp(-reduced.x * x * x - reduced.y * y * y);
+  float z = dot(lobe.axis, kernel.z);
+  float chord = 2.0 / max(1.0 + z, 1e-2);
+  float width = 0.5 * (kernel.sharpness.x + kernel.sharpness.y) + 0.5;
+  float centre = (nu * z + width) * inversesqrt(max(nu * nu + width * width + 2.0 * nu * width * z, 1e-9));
+  float overlap = lkCap(sum) * clamp(centre, 0.0, 1.0) * exp(-(reduced.x * x * x + reduced.y * y * y) * chord);
   return lobe.amplitude * kernel.amplitude * overlap;
 }
