@@ -2,7 +2,7 @@
 
     diffuse           E albedo (1 - metallic) T(o.n) / pi
     interreflection   sum over lobes of the mean of the lobe under K, times R(o.n)                   (steps 3 to 6)
-    environment       U(r, alpha) W_E(r), over the integral of D, times R(o.n)                        (eq. 8)
+    environment       U(z, alpha) W_E(z), over the integral of D, times R(o.n), z the axis of K       (eq. 8)
 
 The paper takes D as an anisotropic Gaussian over light directions (eq. 17 and 18), and F and G at the specular
 direction r. So what a surface reflects of constant light is wrong by up to a half, and of other light by more where it

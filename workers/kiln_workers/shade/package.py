@@ -43,8 +43,8 @@ class Incident(Protocol):
         """Mean of the light field under the surface's kernel [P, 3]; `paper`: its integral times D."""
         ...
 
-    def visibility(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
-        """W_E at the specular direction [P, 3]."""
+    def visibility(self, uv: Tensor, directions: Tensor) -> Tensor:
+        """W_E in one direction a point [P, 3]: [P, 3]."""
         ...
 
 
@@ -61,11 +61,11 @@ class LobeTextures:
             return algorithm.convolved(lobes, algorithm.paper_kernel(surface))
         return algorithm.mean_under(lobes, algorithm.reflection_kernel(surface))
 
-    def visibility(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
+    def visibility(self, uv: Tensor, directions: Tensor) -> Tensor:
         if self.visibility_lobes is None:
-            return torch.ones_like(surface.normal)
+            return torch.ones_like(directions)
         lobes = algorithm.unit_lobes(textures.bilinear(self.visibility_lobes, uv))
-        return algorithm.lobe_sum(lobes, surface.specular)
+        return algorithm.lobe_sum(lobes, directions)
 
 
 @dataclass(frozen=True)

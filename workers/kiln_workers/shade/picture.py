@@ -63,10 +63,11 @@ def _shade_points(
         radiance += incident.reflected(uv, surface, paper) * factor
     reflected = {Term.ENVIRONMENT, *COMPARED} & set(terms)
     if package.environment is not None and reflected:
-        u = package.environment.convolved(surface.specular, surface.alpha)
+        towards = surface.specular if paper else algorithm.reflection_kernel(surface).z
+        u = package.environment.convolved(towards, surface.alpha)
         seen: Tensor | float = 1.0
         if Term.ENVIRONMENT in reflected:
-            seen = incident.visibility(uv, surface)
+            seen = incident.visibility(uv, towards)
         elif Term.MIRROR_VISIBILITY in reflected:
             seen = _tensor(buffer.specular_escapes[part].astype(np.float32), like)[:, None]
         radiance += u * seen * (1.0 if paper else algorithm.mean_scale(surface)) * factor

@@ -62,11 +62,11 @@ class StoredImages:
                 out.index_add_(0, at, weight[part, None] * (chosen(directions) @ light))
         return out
 
-    def visibility(self, uv: Tensor, surface: algorithm.Surface) -> Tensor:
+    def visibility(self, uv: Tensor, directions: Tensor) -> Tensor:
         if Function.VISIBILITY not in self.store.functions:
-            return torch.ones_like(surface.normal)
-        place = textures.octahedral_uv(surface.specular)
-        out = torch.zeros_like(surface.normal)
+            return torch.ones_like(directions)
+        place = textures.octahedral_uv(directions)
+        out = torch.zeros_like(directions)
         for image, point, weight in self._texels(Function.VISIBILITY, uv):
             out.index_add_(0, point, weight[:, None] * textures.bilinear(image, place[point]))
         return out

@@ -60,19 +60,23 @@ vec3 lkInterreflection(sampler2DArray lightField, int count, vec2 uv, LkSurface 
   return sum * lkReflectance(surface, o);
 }
 
-// Glossy reflection of the environment: U over the integral of D, 4 / (1 + alpha^2), times visibility and albedo (eq. 8).
-// u is lkEnvironmentU at the specular direction.
-vec3 lkEnvironmentReflection(sampler2DArray visibility, int count, vec2 uv, LkSurface surface, vec3 o, vec3 u) {
-  vec3 specular = reflect(-o, surface.normal);
-  float alpha = surface.roughness * surface.roughness;
-  vec3 mean = u * (0.25 * (1.0 + alpha * alpha));
-  return mean * lkLobeSum(visibility, count, uv, specular) * lkReflectance(surface, o);
+// Where a glossy surface gathers most of its light from: the specular direction of a mirror, nearer to the normal for a
+// rough surface seen from the side (Lagarde and de Rousiers 2014 call it the dominant direction).
+vec3 lkGlossyDirection(LkSurface surface, vec3 o) {
+  return lkReflectionLobe(surface.normal, o, surface.roughness * surface.roughness).z;
 }
 
-// The same from the GGX cube map, whose mips are means. mean is lkEnvironmentGgx at the specular direction.
+// Glossy reflection of the environment: U over the integral of D, 4 / (1 + alpha^2), times visibility and albedo (eq. 8).
+// u is lkEnvironmentU in lkGlossyDirection.
+vec3 lkEnvironmentReflection(sampler2DArray visibility, int count, vec2 uv, LkSurface surface, vec3 o, vec3 u) {
+  float alpha = surface.roughness * surface.roughness;
+  vec3 mean = u * (0.25 * (1.0 + alpha * alpha));
+  return mean * lkLobeSum(visibility, count, uv, lkGlossyDirection(surface, o)) * lkReflectance(surface, o);
+}
+
+// The same from the GGX cube map, whose mips are means. mean is lkEnvironmentGgx in lkGlossyDirection.
 vec3 lkEnvironmentSplitSum(sampler2DArray visibility, int count, vec2 uv, LkSurface surface, vec3 o, vec3 mean) {
-  vec3 specular = reflect(-o, surface.normal);
-  return mean * lkLobeSum(visibility, count, uv, specular) * lkReflectance(surface, o);
+  return mean * lkLobeSum(visibility, count, uv, lkGlossyDirection(surface, o)) * lkReflectance(surface, o);
 }
 
 // Diffuse reflection of the baked irradiance (W/m^2), without what the specular layer reflects: 1 - F(o.h) averaged over

@@ -31,9 +31,9 @@ void main() {
   vec3 radiance = uEmission + lkDiffuse(uIrradiance, vLightmap, surface, o);
   radiance += lkInterreflection(uLightField, uLightFieldLobes, vLightmap, surface, o);
 #ifdef LK_ENVIRONMENT
-  vec3 specular = reflect(-o, surface.normal);
+  vec3 towards = lkGlossyDirection(surface, o);
   float alpha = uRoughness * uRoughness;
-  vec3 u = lkEnvironmentU(uEnvironmentU, uEnvironmentAlphas, uEnvironmentLayers, specular, alpha);
+  vec3 u = lkEnvironmentU(uEnvironmentU, uEnvironmentAlphas, uEnvironmentLayers, towards, alpha);
   radiance += lkEnvironmentReflection(uVisibility, uVisibilityLobes, vLightmap, surface, o, u);
 #endif
   // Linear radiance: expose, tone-map and encode in a later pass.
