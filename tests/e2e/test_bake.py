@@ -26,7 +26,14 @@ def test_package_is_whole(baked: Path) -> None:
     for name in TEXTURES:
         assert ktx2_validate.validate((baked / name).read_bytes()) == [], name
     assert manifest["overflows"] == 0
-    assert set(manifest["stage_seconds"]) == {"prepare", "render", "fit light_field", "fit visibility", "package"}
+    assert set(manifest["stage_seconds"]) == {
+        "prepare",
+        "render",
+        "fit light_field",
+        "fit visibility",
+        "refine",
+        "package",
+    }
 
 
 @pytest.mark.parametrize(("function", "bound"), [("light_field", 0.4), ("visibility", 0.1)])

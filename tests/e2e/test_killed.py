@@ -16,7 +16,7 @@ def is_active(farm: Farm, job: str, kind: str) -> bool:
 
 def test_killed_processes_change_no_byte(farm: Farm, room_files: tuple[Path, Path], baked: Path, folder: Path) -> None:
     """Against the undisturbed bake of one command, which makes a checkpoint a minute and so none at all."""
-    flags = ["--kinds", "prepare,render,fit,package", "--threads", threads()]
+    flags = ["--kinds", "prepare,render,fit,refine,package", "--threads", threads()]
     job = farm.submit(*room_files, *settings("fit.checkpoint_s=1"))
 
     # A render worker dies with a tile in its hands, and another takes over.

@@ -21,7 +21,7 @@ def test_a_store_in_a_bucket(
     try:
         farm.start_coordinator("--store", f"s3://{s3_server.bucket}/light-fields")
         farm.start_worker("first", "--kinds", "prepare,render", "--threads", "1")
-        farm.start_worker("second", "--kinds", "fit,package", "--threads", "1")
+        farm.start_worker("second", "--kinds", "fit,refine,package", "--threads", "1")
         job = farm.submit(*room_files, *settings())
         farm.finish(job)
         package = farm.download(job, folder / "package")

@@ -23,6 +23,7 @@ from kiln_schemas.gates import check_gates, read_cameras, read_gates
 from kiln_schemas.job import JobRequest
 from kiln_schemas.settings import make_settings
 from kiln_schemas.states import FINAL_JOB_STATES, PUBLISHED_JOB_STATES, JobState
+from kiln_schemas.tasks import TaskKind
 from kiln_service.cli import bake as baking
 from kiln_service.cli import options
 from kiln_service.cli.become import become
@@ -155,9 +156,9 @@ def worker(
     token: options.Token = None,
     token_file: Annotated[Path | None, typer.Option("--token-file", help="File that holds the token.")] = None,
     data: options.Data = None,
-    kinds: Annotated[
-        str, typer.Option("--kinds", help="Kinds of tasks to take, separated by commas.")
-    ] = "prepare,render,fit,package",
+    kinds: Annotated[str, typer.Option("--kinds", help="Kinds of tasks to take, separated by commas.")] = ",".join(
+        TaskKind
+    ),
     memory: Annotated[str | None, typer.Option("--memory", help="Main memory to use, e.g. 4GiB.")] = None,
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Cores to use; all by default.")] = None,
     name: Annotated[str | None, typer.Option("--name", help="As the dashboard shows it.")] = None,
