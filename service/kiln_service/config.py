@@ -48,7 +48,7 @@ class Limits(Contract):
     page: int = Field(default=200, gt=0)
     """Most jobs on a page."""
     tiles: int = Field(default=65536, gt=0)
-    """Most render tiles of a job."""
+    """Most render tiles of a job, and most blocks to refine."""
 
 
 class Timing(Contract):

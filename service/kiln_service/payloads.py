@@ -20,7 +20,6 @@ from kiln_schemas.tasks import (
     RenderPayload,
     RenderResult,
     TaskKind,
-    Tile,
 )
 from kiln_service.db import JobRow, TaskRow, Tx
 
@@ -49,7 +48,7 @@ async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Payload:
                 block=block,
                 texel_map=prepared["texel_map"],
                 between=prepared["between"],
-                renders=tuple(result for result in await _renders(tx, job) if _near(result.tile, block)),
+                renders=await _renders_near(tx, job, block),
                 fit=next(result for result in fits if result.function is Function.LIGHT_FIELD),
             )
         case TaskKind.PACKAGE:
@@ -78,12 +77,20 @@ async def _fits(tx: Tx, job: JobRow) -> tuple[FitResult, ...]:
     return tuple(FitResult.model_validate(row["result"]) for row in rows)
 
 
-def _near(tile: Tile, block: Block) -> bool:
-    """Whether a tile has texels in a block or its halo."""
-    starts = ((tile.row, block.row), (tile.column, block.column))
-    return all(t < b + block.size + REFINE_HALO and t + tile.size > b - REFINE_HALO for t, b in starts)
-
-
 async def _renders(tx: Tx, job: JobRow) -> tuple[RenderResult, ...]:
     rows = await tx.all("results_of_kind", job_id=job.id, kind=TaskKind.RENDER)
+    return tuple(RenderResult.model_validate(row["result"]) for row in rows)
+
+
+async def _renders_near(tx: Tx, job: JobRow, block: Block) -> tuple[RenderResult, ...]:
+    """Of the tiles with texels in a block or its halo: some 9, where the light map may have 65536."""
+    reach = block.size + REFINE_HALO
+    rows = await tx.all(
+        "renders_near",
+        job_id=job.id,
+        row_start=block.row - REFINE_HALO,
+        row_stop=block.row + reach,
+        column_start=block.column - REFINE_HALO,
+        column_stop=block.column + reach,
+    )
     return tuple(RenderResult.model_validate(row["result"]) for row in rows)

@@ -65,7 +65,8 @@ def plan_job() -> list[Planned]:
 def plan_after_prepare(result: PrepareResult, settings: BakeSettings, gates: Gates, most_tiles: int) -> list[Planned]:
     """Render tasks (ready); fit tasks, refine tasks and the package task (waiting).
 
-    InputError where there is nothing to bake, the tiles do not fit the light map or a gate has nothing to measure.
+    InputError where there is nothing to bake, the tiles do not fit the light map or a gate has nothing to measure;
+    TooLarge where there are more than `most_tiles` tiles or blocks.
     """
     _check_prepared(result, settings, most_tiles)
     if gates.visibility_log_mse_rel is not None and not result.has_environment:
@@ -81,6 +82,12 @@ def plan_after_prepare(result: PrepareResult, settings: BakeSettings, gates: Gat
     functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if result.has_environment else [])
     fits = [Planned(TaskKind.FIT, function.value, {"function": function.value}) for function in functions]
     blocks = plan_blocks(result.tiles, settings) if settings.fit.solver is Solver.COHERENT else []
+    if len(blocks) > most_tiles:
+        raise TooLarge(
+            f"{len(blocks)} blocks to refine are more than {most_tiles}",
+            where="fit.block",
+            remedy="Raise fit.block or lower lightmap.resolution.",
+        )
     refines = [
         Planned(TaskKind.REFINE, f"block {block.row},{block.column}", {"block": block.model_dump(mode="json")})
         for block in blocks

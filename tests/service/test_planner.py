@@ -82,6 +82,18 @@ def test_too_many_tiles():
         plan(prepared([tile(0, 0), tile(0, 8)]), most=1)
 
 
+def test_too_many_blocks():
+    """A tile of 64 texels holds 64 blocks of 8, which are tasks too."""
+    settings = make_settings("production", ["fit.block=8", "lightmap.tile=64"])
+    result = prepared([Tile(row=0, column=64, size=64, texels=9)])
+    assert len(plan_after_prepare(result, settings, Gates(), 64)) == 1 + 2 + 64 + 1
+    with pytest.raises(TooLarge, match="64 blocks to refine are more than 63") as refused:
+        plan_after_prepare(result, settings, Gates(), 63)
+    assert refused.value.where == "fit.block" and "fit.block" in refused.value.remedy
+    network = make_settings("production", ["fit.block=8", "lightmap.tile=64", "fit.solver=cnn"])
+    assert len(plan_after_prepare(result, network, Gates(), 63)) == 1 + 2 + 1, "no blocks, nothing to refuse"
+
+
 def stage(total, completed=0, seconds=0.0, running=()):
     fractions, elapsed = [list(part) for part in zip(*running, strict=True)] if running else [None, None]
     return {"total": total, "completed": completed, "seconds": seconds, "fractions": fractions, "elapsed": elapsed}

@@ -28,6 +28,16 @@ SELECT count(*) AS tasks FROM tasks WHERE job_id = %(job_id)s AND state = 'activ
 -- Results of a job's tasks of a kind, in the order of planning.
 SELECT result FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state = 'completed' ORDER BY ordinal;
 
+-- name: renders_near
+-- Results of a job's render tasks whose tiles have texels from `start` to before `stop` in rows and columns.
+SELECT result FROM tasks
+WHERE job_id = %(job_id)s AND kind = 'render' AND state = 'completed'
+  AND (spec -> 'tile' ->> 'row')::int < %(row_stop)s
+  AND (spec -> 'tile' ->> 'row')::int + (spec -> 'tile' ->> 'size')::int > %(row_start)s
+  AND (spec -> 'tile' ->> 'column')::int < %(column_stop)s
+  AND (spec -> 'tile' ->> 'column')::int + (spec -> 'tile' ->> 'size')::int > %(column_start)s
+ORDER BY ordinal;
+
 -- name: prepared_blobs
 -- The blobs that a job's prepare task made; its whole result may list thousands of tiles.
 SELECT result ->> 'scene' AS scene, result ->> 'texel_map' AS texel_map,
