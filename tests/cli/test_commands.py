@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import pytest
 
 from kiln_schemas.conventions import MANIFEST_JSON
+from kiln_schemas.tasks import TaskKind
 
 DEAD = "http://127.0.0.1:9"
 
@@ -138,6 +139,11 @@ def test_an_unknown_job(lightkiln, coordinator, command: list[str]) -> None:
 def test_a_wrong_token(lightkiln, coordinator) -> None:
     ran = lightkiln("status", "--url", coordinator.url, "--token", "wrong", "--json")
     assert ran.code == 6 and ran.document["code"] == "unauthorized"
+
+
+def test_a_worker_takes_all_kinds_unless_told(lightkiln) -> None:
+    ran = lightkiln("worker", "--help")
+    assert ran.code == 0 and ",".join(TaskKind) in ran.out
 
 
 def test_a_worker_with_a_wrong_token_ends(lightkiln, coordinator) -> None:

@@ -202,7 +202,7 @@ def options_for(url: str, folder: Path) -> WorkerOptions:
         url=url,
         token=TOKEN,
         name="tester",
-        kinds=(TaskKind.FIT,),
+        kinds=(TaskKind.FIT, TaskKind.REFINE),
         memory_bytes=1 << 30,
         threads=1,
         folder=folder,

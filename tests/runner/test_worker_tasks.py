@@ -6,6 +6,8 @@ import time
 import pytest
 
 from kiln_schemas.errors import AuthError, NotFound
+from kiln_schemas.settings import PRESETS
+from kiln_schemas.tasks import Block, Claim, FitResult, RefinePayload
 from kiln_workers.runner.parent import Worker
 
 
@@ -162,6 +164,28 @@ def test_a_wrong_token_ends_the_worker(coordinator, worker: Worker) -> None:
     coordinator.refuse["workers"] = AuthError("wrong token")
     with pytest.raises(AuthError):
         worker.step()
+
+
+def test_a_node_for_fit_and_refine_runs_both_without_a_renderer(coordinator, worker: Worker) -> None:
+    coordinator.add("")
+    worker.step()
+    fit = FitResult.model_validate(coordinator.named("/commit")[0]["result"])
+    payload = RefinePayload(
+        block=Block(row=32, column=64, size=32),
+        texel_map="0" * 64,
+        renders=(),
+        fit=fit,
+        settings=PRESETS["draft"],
+        store_url="file:///store",
+    )
+    coordinator.claims.append(Claim(task_id="refine", job_id="job", attempt=2, payload=payload))
+    worker.step()
+    commit = coordinator.named("/v1/tasks/refine/commit")[0]
+    assert (commit["attempt"], commit["result"]["kind"], commit["result"]["steps"]) == (2, "refine", 1)
+    assert commit["result"]["block"] == {"row": 32, "column": 64, "size": 32}
+    assert coordinator.blobs[commit["result"]["lobes"]] == b"imported: []"
+    (registration,) = coordinator.named("/v1/workers")
+    assert (registration["kinds"], registration["device"]) == (["fit", "refine"], "1 threads")
 
 
 def test_blobs_come_whole(coordinator, worker: Worker) -> None:
