@@ -1,6 +1,7 @@
 """Interruptions, failed fits, curves and estimates of a comparison."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from kiln_workers.fit.network import Shape, initial_parameters
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, Solver, nobody
 from kiln_workers.fit.solvers import SOLVERS
+from kiln_workers.fit.solvers.descent import AdamOptions
 from kiln_workers.fit.solvers.evaluate import errors_at_texels
 from kiln_workers.package.half import as_stored
 
@@ -33,6 +35,13 @@ def steady(field: TexelField, lobes: int, on_epoch: OnEpoch = nobody) -> Solutio
         made = Lobes(torch.cat([made.parameters[..., :4], torch.full((len(field), lobes, 3), 2.0**-epoch)], dim=-1))
         on_epoch(epoch, made)
     return Solution(made, 30, 1.5)
+
+
+def turned(field: TexelField, lobes: int, on_epoch: OnEpoch = nobody) -> Solution:
+    """Every texel has directions of its own."""
+    angle = torch.arange(len(field) * lobes).reshape(len(field), lobes) * 0.1
+    axes = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1)
+    return Solution(Lobes(torch.cat([axes, torch.ones(len(field), lobes, 4)], dim=-1)), 1, 0.1)
 
 
 def stopped(field: TexelField, lobes: int, on_epoch: OnEpoch = nobody) -> Solution:
@@ -144,3 +153,21 @@ def test_a_network_of_another_shape_is_refused(tmp_path: Path) -> None:
         warm_start(str(tmp_path / "w.bin"), 32, 8)
     with pytest.raises(NotFound, match="no such file"):
         warm_start(str(tmp_path / "nothing"), 32, 8)
+
+
+def test_fixed_directions_take_no_room(kept_bake: Path, tmp_path: Path) -> None:
+    subject = open_subject(str(kept_bake), None, None, None)
+    brief = partial(SOLVERS["fixed-log"], options=AdamOptions(steps=3, rate=0.2))
+    solvers = {"turned": turned, "fixed": SOLVERS["fixed"], "fixed-log": brief, "sh": SOLVERS["sh"]}
+    result = run(subject, plan(tmp_path, solvers))
+    floats = {row.solver: row.floats_per_texel for row in result.rows}
+    assert floats == {"turned": 21, "fixed": 9, "fixed-log": 9, "sh": 12}
+
+
+def test_the_best_is_marked_where_there_are_rivals(kept_bake: Path, tmp_path: Path) -> None:
+    subject = open_subject(str(kept_bake), None, None, None)
+    result = run(subject, plan(tmp_path, {"fixed": SOLVERS["fixed"], "fixed-12": SOLVERS["fixed-12"]}))
+    page = (tmp_path / "index.html").read_text()
+    assert [row.lobes for row in result.rows] == [3, 12] and page.count('class="best"') == 0
+    run(subject, plan(tmp_path, {"fixed": SOLVERS["fixed"], "steady": steady}))
+    assert (tmp_path / "index.html").read_text().count('class="best"') == 4

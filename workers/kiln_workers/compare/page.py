@@ -7,6 +7,7 @@ crops of one place for all solvers, enlarged pixel by pixel, because what tells 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from operator import attrgetter
 from typing import Any, Final
 
 import jinja2
@@ -29,6 +30,9 @@ UInt8 = npt.NDArray[np.uint8]
 
 CROP: Final = (90, 120)
 """Rows and columns of a crop, in pixels of the picture."""
+
+BEST: Final = ("log_mse_rel", "log_mse_between_rel", "mse", "seconds_per_texel")
+"""Metrics whose best is marked. Not interp_ratio: who is equally wrong everywhere has the best of these."""
 
 
 @dataclass(frozen=True)
@@ -91,13 +95,15 @@ def crop_of(view: View) -> tuple[slice, slice]:
     return slice(int(row), int(row) + rows), slice(int(column), int(column) + columns)
 
 
-def _best(rows: Sequence[Row]) -> dict[int, dict[str, float]]:
-    """Least value of each metric by number of lobes."""
-    metrics = ("log_mse_rel", "log_mse_between_rel", "mse", "interp_ratio", "seconds_per_texel")
-    return {
-        lobes: {metric: min(getattr(row, metric) for row in rows if row.lobes == lobes) for metric in metrics}
-        for lobes in {row.lobes for row in rows}
-    }
+def _best(rows: Sequence[Row]) -> set[tuple[str, int, str]]:
+    """(solver, lobes, metric) where no other solver with as many lobes is better; nobody is best of one."""
+    out = set()
+    for lobes in {row.lobes for row in rows}:
+        rivals = [row for row in rows if row.lobes == lobes]
+        for metric in BEST if len(rivals) > 1 else ():
+            best = min(rivals, key=attrgetter(metric))
+            out.add((best.solver, lobes, metric))
+    return out
 
 
 def _shown(given: PageInput, one: Solved, crops: Sequence[tuple[View, tuple[slice, slice]]]) -> dict[str, Any]:
