@@ -16,6 +16,7 @@ from kiln_schemas.tasks import Bundle, FitMetrics, PreparePayload, RenderPayload
 from kiln_workers.fit.metrics import exposure_of
 from kiln_workers.fit.source import StoreSource
 from kiln_workers.package import exr, ktx2
+from kiln_workers.package.files import artifact
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.package.half import lobes_to_layers
 from kiln_workers.scene.archive import unpack_scene
@@ -92,7 +93,7 @@ def kept_bake(tmp_path_factory: pytest.TempPathFactory) -> Path:
         overflows=0,
         versions={},
         notes=(),
-        files=(),
+        files=(artifact(folder, conventions.SCENE_GLB),),
     )
     (folder / conventions.MANIFEST_JSON).write_text(manifest.model_dump_json())
     return folder

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kiln_schemas.errors import InputError
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.__main__ import main
@@ -170,8 +171,24 @@ def test_what_is_missing_is_said(kept_bake: Path, tmp_path: Path, capsys: pytest
     alone = tmp_path / "package"
     shutil.copytree(kept_bake, alone, ignore=shutil.ignore_patterns(".lightkiln"))
     assert "store was not kept" in told(str(alone))
+    with (alone / "scene.glb").open("ab") as file:
+        file.write(b"    ")
+    assert "was changed since the bake" in told(str(alone), "--store", str(store))
     (alone / "scene.glb").unlink()
     assert "the scene is missing" in told(str(alone), "--store", str(store))
+
+
+def test_a_package_of_an_older_version_is_taken(kept_bake: Path, tmp_path: Path) -> None:
+    """A setting that is new here changes no hash of what was baked without it."""
+    bake = tmp_path / "bake"
+    shutil.copytree(kept_bake, bake)
+    manifest = json.loads((bake / "manifest.json").read_text())
+    del manifest["settings"]["render"]["max_depth"]
+    (bake / "manifest.json").write_text(json.dumps(manifest))
+    assert open_subject(str(bake), None, None, None).manifest.scene_hash == manifest["scene_hash"]
+    (bake / "manifest.json").write_text(json.dumps(manifest | {"scene_hash": "b" * 64}))
+    with pytest.raises(InputError, match="rendered from another scene"):
+        open_subject(str(bake), None, None, None)
 
 
 def test_a_store_without_valid_texels_is_refused(

@@ -34,8 +34,8 @@ from kiln_workers.shade.image_files import write_picture
 MEMORY_SHARE: Final = 0.5
 """Of the memory, what light fields may take; the rest is for the solvers and for wavefronts."""
 
-SAME_RENDERER: Final = 0.01
-"""log_mse_rel between stored and retraced light fields above which they come from different renderers."""
+SAME_RENDERER: Final = 1e-4
+"""log_mse_rel between stored and retraced light fields that is worth a note; one renderer gives 0 on one machine."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def _begin(subject: Subject, plan: Plan, chosen: ChosenTexels, cache: Cache, dis
     if retraced > SAME_RENDERER:
         found.notes.append(
             f"Light fields traced again differ from the stored ones by {retraced:.2g} of the error of P = 0: another "
-            "version of the renderer baked them, so errors between texels contain that difference."
+            "version of the renderer, or another kind of machine, baked them. Errors between texels contain that."
         )
     if not chosen.whole:
         found.notes.append(f"Only {chosen.tiles} of {chosen.of_tiles} tiles were taken.")

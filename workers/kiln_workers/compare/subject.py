@@ -1,8 +1,9 @@
 """What is compared on: a light-field store, the package that was made from it, and the scene that was rendered.
 
 The store holds what solvers are fitted to. Between points are traced afresh, so the scene is needed too: it is read
-from the package's `scene.glb` (which keeps the light map's UV) and, where there is one, the environment's file. That
-it is the very scene of the store is checked by the hash that the store carries.
+from the package's `scene.glb` (which keeps the light map's UV) and, where there is one, the environment's file. Store
+and package carry the hash of the scene that was baked, and the manifest those of both files. The scene's hash is not
+computed anew, because it covers the settings as the version that baked knew them.
 """
 
 import hashlib
@@ -19,7 +20,6 @@ from kiln_schemas.conventions import MANIFEST_JSON, SCENE_GLB
 from kiln_schemas.errors import InputError, NotFound
 from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import BakeSettings, Function
-from kiln_workers.scene.archive import scene_hash
 from kiln_workers.scene.environment import read_environment
 from kiln_workers.scene.gltf import read_gltf
 from kiln_workers.scene.model import Environment, Scene
@@ -71,8 +71,8 @@ def open_subject(named: str, package: Path | None, store: str | None, env: Path 
         raise InputError("the store has no light field", where=url)
     if Function.LIGHT_FIELD.value not in manifest.exposure:
         raise InputError("the package has no light field", where=str(folder), remedy="Bake a scene with light in it.")
-    scene = _with_environment(_scene(folder), folder, manifest, env)
-    if scene_hash(scene, manifest.settings.render) != opened.attributes["scene_hash"]:
+    scene = _with_environment(_scene(folder, manifest), folder, manifest, env)
+    if manifest.scene_hash != opened.attributes["scene_hash"]:
         raise InputError(
             "the store was rendered from another scene or with other settings",
             where=f"{url} and {folder}",
@@ -124,9 +124,14 @@ def _local(text: str) -> Path | None:
     return Path(unquote(parts.path)) if parts.scheme == "file" else None
 
 
-def _scene(folder: Path) -> Scene:
-    if not (folder / SCENE_GLB).is_file():
-        raise NotFound("the scene is missing", where=str(folder / SCENE_GLB), remedy="Download the package again.")
+def _scene(folder: Path, manifest: Manifest) -> Scene:
+    """The package's scene, which has to be the file that the manifest names."""
+    path = folder / SCENE_GLB
+    if not path.is_file():
+        raise NotFound("the scene is missing", where=str(path), remedy="Download the package again.")
+    wanted = {file.name: file.sha256 for file in manifest.files}.get(SCENE_GLB)
+    if hashlib.sha256(path.read_bytes()).hexdigest() != wanted:
+        raise InputError("was changed since the bake", where=str(path), remedy="Download the package again.")
     scene = read_gltf(folder, SCENE_GLB)
     for mesh in scene.meshes:
         if mesh.lightmap_uv is None:
