@@ -20,6 +20,7 @@ from kiln_workers.compare.result import Camera as CameraView
 from kiln_workers.compare.result import ImageScore
 from kiln_workers.compare.subject import Subject
 from kiln_workers.compare.texels import ChosenTexels
+from kiln_workers.fit.lobes import amplitude_scale
 from kiln_workers.package import colour
 from kiln_workers.package.dilate import plan_fill
 from kiln_workers.package.half import as_stored
@@ -147,7 +148,7 @@ class Studio:
         """The lobe texture [H, W, N, 7] as the package would hold it."""
         field, shape = self._chosen.field, self._chosen.texel_map.state.shape
         out = np.zeros((*shape, *lobes.shape[1:]), np.float32)
-        scale = np.array([1.0] * 4 + [1.0 / field.exposure] * 3, np.float32)
+        scale = amplitude_scale(1.0 / field.exposure).numpy()
         out[field.place[:, 0], field.place[:, 1]] = lobes * scale
         return as_stored(self._fill.nearest(out))
 

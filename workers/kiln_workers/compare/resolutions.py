@@ -118,14 +118,7 @@ def _render(
             where=f"--resolutions {resolution}",
             remedy="Leave it out, lower --resolution-image-size or raise --memory.",
         )
-    batch = TexelBatch(
-        index=(row * resolution + column).astype(np.int64),
-        position=texel_map.position[row, column],
-        normal=texel_map.normal[row, column],
-        shading_normal=texel_map.shading_normal[row, column],
-        alpha=texel_map.alpha[row, column],
-        texel_size=texel_map.texel_size[row, column],
-    )
+    batch = TexelBatch.of(texel_map, (row, column))
     renderer = TileRenderer(subject.scene, subject.manifest.scene_hash, settings, memory_bytes)
     made = renderer.render_light_fields(batch, on_progress)
     keep = made.back_faces <= BACK_FACE_LIMIT

@@ -9,19 +9,17 @@ from hashlib import sha256
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from kiln_schemas.errors import InputError, TooLarge
-from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.compare.subject import Subject
-from kiln_workers.fit.between import read_between
+from kiln_workers.fit.between import read_field
 from kiln_workers.fit.field import TexelField
 from kiln_workers.fit.source import valid_texels
 from kiln_workers.render.between import between_maps
 from kiln_workers.scene.texel_map import TexelMap, TexelState
 from kiln_workers.scene.texels import build_texel_map, rasterise_texels
-from kiln_workers.stages.tiles import map_coordinates, plan_tiles
+from kiln_workers.stages.tiles import plan_tiles
 
 DEFAULT_BYTES: Final = 2 << 30
 """Bytes that the light fields may take in memory."""
@@ -73,7 +71,14 @@ def choose_texels(subject: Subject, tiles: int | None, memory_bytes: int = DEFAU
             where=store.url,
             remedy=f"Take some of its tiles (--tiles {fits} would fit), or raise --memory.",
         )
-    return ChosenTexels(_read(subject, texel_map, chosen), texel_map, len(chosen), len(planned))
+
+    def moved() -> tuple[TexelMap, ...]:
+        # The points that counted when the bake was prepared, before rendering found invalid texels.
+        return between_maps(subject.scene, build_texel_map(subject.scene, store.shape[0]))
+
+    wanted = [(tile, valid_texels(texel_map.state, tile)) for tile in chosen]
+    field = read_field(store, texel_map, wanted, subject.exposure, moved)
+    return ChosenTexels(field, texel_map, len(chosen), len(planned))
 
 
 def _texel_map(subject: Subject) -> TexelMap:
@@ -93,20 +98,3 @@ def _evenly(planned: list[Tile], count: int) -> list[Tile]:
     """`count` of the tiles, evenly spread over their list (row by row)."""
     at = np.unique(np.floor((np.arange(count) + 0.5) * len(planned) / count).astype(np.int64))
     return [planned[number] for number in at]
-
-
-def _read(subject: Subject, texel_map: TexelMap, tiles: list[Tile]) -> TexelField:
-    images, places = [], []
-    wanted = [(tile, valid_texels(texel_map.state, tile)) for tile in tiles]
-    for tile, inside in wanted:
-        places.append(np.stack(map_coordinates(tile, inside), axis=1))
-        images.append(subject.store.read_tile(Function.LIGHT_FIELD, tile, inside))
-    place = np.concatenate(places)
-    at = place[:, 0], place[:, 1]
-    chart: npt.NDArray[np.int64] = texel_map.chart[at].astype(np.int64)
-    field = TexelField(np.concatenate(images), texel_map.normal[at], place, chart, subject.exposure)
-    if not subject.store.has_between:
-        return field
-    # The points that counted when the bake was prepared, before rendering found invalid texels.
-    moved = between_maps(subject.scene, build_texel_map(subject.scene, subject.store.shape[0]))
-    return replace(field, traced=read_between(subject.store, field, moved, wanted))

@@ -1,9 +1,11 @@
-"""What a bake traced half-way between texels, read from its store for a field of texels."""
+"""A part of the light map read from a bake's store: its light fields, and what was traced half-way between texels."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.fit.field import TexelField, TracedBetween
 from kiln_workers.fit.source import Index
@@ -11,14 +13,33 @@ from kiln_workers.scene.texel_map import TexelMap, TexelState
 from kiln_workers.store.layout import BETWEEN_STEPS, sparse_offsets
 from kiln_workers.store.light_field import LightFieldStore
 
+Moved = Callable[[], tuple[TexelMap, ...]]
+"""Makes the texel maps of the points between (`render.between.between_maps`), where they are wanted."""
 
-def read_between(
-    store: LightFieldStore, field: TexelField, moved: tuple[TexelMap, ...], tiles: Iterable[tuple[Tile, Index]]
+
+def read_field(
+    store: LightFieldStore, texel_map: TexelMap, tiles: Sequence[tuple[Tile, Index]], exposure: float, moved: Moved
+) -> TexelField:
+    """The light fields of texels, tile by tile: a tile and row-major indices of valid texels inside of it."""
+    size = store.image_size
+    images, places = [np.empty((0, size, size, 3), np.float16)], [np.empty((0, 2), np.int64)]
+    for tile, inside in tiles:
+        rows, columns = np.divmod(inside, tile.size)
+        places.append(np.stack([rows + tile.row, columns + tile.column], axis=1))
+        images.append(store.read_tile(Function.LIGHT_FIELD, tile, inside))
+    place = np.concatenate(places)
+    at = place[:, 0], place[:, 1]
+    chart = texel_map.chart[at].astype(np.int64)
+    field = TexelField(np.concatenate(images), texel_map.normal[at], place, chart, exposure)
+    if not store.has_between or not len(field):
+        return field
+    return replace(field, traced=_read_between(store, field, moved(), tiles))
+
+
+def _read_between(
+    store: LightFieldStore, field: TexelField, moved: tuple[TexelMap, ...], tiles: Sequence[tuple[Tile, Index]]
 ) -> TracedBetween:
-    """Of the field's between points those that count: whose texel is VALID in `moved`, one map a kind.
-
-    `tiles` are the field's texels: a tile and row-major indices inside of it.
-    """
+    """Of the field's between points those that count: whose texel is VALID in `moved`, one map a kind."""
     between, half = field.between, store.image_size // 2
     number = np.full(store.shape, -1, np.int64)
     row, column = field.place.T

@@ -34,6 +34,11 @@ def fibonacci_axes(count: int) -> Tensor:
     return torch.from_numpy(np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1).astype(np.float32))
 
 
+def amplitude_scale(factor: float) -> Tensor:
+    """[7] by which lobes are multiplied so that their radiance is `factor` times as much."""
+    return torch.tensor([1.0] * (LOBE_PARAMETERS - 3) + [factor] * 3)
+
+
 def constrain(raw: Tensor, normals: Tensor) -> Tensor:
     """Lobes [T, N, 7] in exposure-normalised radiance from outputs [T, N, 7] and unit normals [T, 3]."""
     count = raw.shape[1]

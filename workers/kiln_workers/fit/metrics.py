@@ -15,6 +15,7 @@ import torch
 
 from kiln_schemas.conventions import EXPOSURE_KEY
 from kiln_schemas.settings import Function
+from kiln_workers.fit.lobes import amplitude_scale
 from kiln_workers.fit.loss import lobe_values
 from kiln_workers.fit.network import pixel_centres, solid_angles
 from kiln_workers.fit.source import Float16, Float32, TexelSource
@@ -59,7 +60,7 @@ class TexelErrors:
 
 def texel_errors(lobes: Float32, images: Float16, normals: Float32, exposure: float) -> TexelErrors:
     """Errors of lobes [T, N, 7] in scene units against images [T, R, R, 3]; unit geometric normals [T, 3]."""
-    scale = torch.tensor([1.0] * 4 + [exposure] * 3)
+    scale = amplitude_scale(exposure)
     parts = []
     for start in range(0, len(images), _TEXELS_AT_ONCE):
         part = slice(start, start + _TEXELS_AT_ONCE)

@@ -67,6 +67,24 @@ class Adam:
         self.parameters[part].addcdiv_(mean, denominator, value=-rate / (1.0 - BETA_1**step))
 
 
+class Moments:
+    """Adam's running means of a gradient and of its square, for a solver that moves its parameters itself."""
+
+    def __init__(self, parameters: Tensor, epsilon: float) -> None:
+        self._mean, self._square = torch.zeros_like(parameters), torch.zeros_like(parameters)
+        self._epsilon = epsilon
+
+    def update(self, gradient: Tensor, step: int) -> tuple[Tensor, Tensor, float]:
+        """Mean, denominator and what corrects the mean's start; the move is -rate mean / denominator / correction.
+
+        `step` counts from 1.
+        """
+        self._mean.lerp_(gradient, 1.0 - BETA_1)
+        self._square.mul_(BETA_2).addcmul_(gradient, gradient, value=1.0 - BETA_2)
+        denominator = (self._square / (1.0 - BETA_2**step)).sqrt_().add_(self._epsilon)
+        return self._mean, denominator, 1.0 - BETA_1**step
+
+
 def one_cycle(step: int, steps: int, peak: float) -> float:
     """Learning rate of a step (from 0): a cosine from START * peak up to the peak and down to END * peak."""
     warm = max(1.0, WARM_UP * steps)

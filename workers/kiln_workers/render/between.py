@@ -68,7 +68,7 @@ def trace_sparse(
 ) -> tuple[Float16, int]:
     """Sparse light fields [B, R / 2, R / 2, 3] of the points `place` of one of `between_maps`, and the paths traced."""
     offsets = sparse_offsets(*place, kind)
-    batch = _batch(moved, place, (SPARSE_SEQUENCE + kind) * moved.state.size)
+    batch = TexelBatch.of(moved, place, (SPARSE_SEQUENCE + kind) * moved.state.size)
     traced = renderer.render_light_fields(batch, on_progress, samples=samples, offsets=offsets)
     images = traced.light_field
     half = images.shape[1] // 2
@@ -102,20 +102,20 @@ def place_between(
 ) -> PlacedPoints:
     """Up to `count` points of each kind between the field's texels, drawn evenly at random from `seed`.
 
-    `texel_map` is the scene's at the field's resolution; only its meshes and charts are read.
+    `texel_map` is the scene's at the field's resolution.
     """
     chosen, batches = [], []
-    for kind, step in enumerate(BETWEEN_STEPS):
-        moved, usable = _moved_map(scene, texel_map, step, device)
+    for kind, (step, moved) in enumerate(zip(BETWEEN_STEPS, between_maps(scene, texel_map, device), strict=True)):
         mine = np.flatnonzero((field.between.step == step).all(axis=1))
         row, column = field.place[field.between.first[mine]].T
-        mine, row, column = (values[usable[row, column]] for values in (mine, row, column))
+        counts = moved.state[row, column] == TexelState.VALID
+        mine, row, column = (values[counts] for values in (mine, row, column))
         drawn = np.random.default_rng([seed, kind]).permutation(len(mine))[:count]
         drawn.sort()
         place = row[drawn], column[drawn]
         chosen.append(mine[drawn])
         texels = texel_map.state.size
-        batches.append(_batch(moved, place, (1 + kind) * texels))
+        batches.append(TexelBatch.of(moved, place, (1 + kind) * texels))
     joined = {name: np.concatenate([getattr(b, name) for b in batches]) for name in TexelBatch.__dataclass_fields__}
     return PlacedPoints(field.between.take(np.concatenate(chosen)), TexelBatch(**joined))
 
@@ -179,14 +179,3 @@ def _moved_map(scene: Scene, texel_map: TexelMap, step: tuple[int, int], device:
 def _uv(values: Float32 | None) -> npt.NDArray[np.float64]:
     assert values is not None
     return values.astype(np.float64)
-
-
-def _batch(texel_map: TexelMap, place: tuple[Index, Index], first: int) -> TexelBatch:
-    return TexelBatch(
-        index=first + place[0] * texel_map.state.shape[1] + place[1],
-        position=texel_map.position[place],
-        normal=texel_map.normal[place],
-        shading_normal=texel_map.shading_normal[place],
-        alpha=texel_map.alpha[place],
-        texel_size=texel_map.texel_size[place],
-    )

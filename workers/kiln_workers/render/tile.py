@@ -8,7 +8,7 @@ changes no byte of the result.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.paths import TEXEL_OFFSET, LaneSums, PathTracer, Start
 from kiln_workers.render.visibility import RayTable, texel_hash, trace_visibility, weighted_visibility
 from kiln_workers.scene.model import Float32, Scene
+from kiln_workers.scene.texel_map import TexelMap
 from kiln_workers.sphere import octahedral
 
 Float16 = npt.NDArray[np.float16]
@@ -50,6 +51,18 @@ class TexelBatch:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    @classmethod
+    def of(cls, texel_map: TexelMap, place: tuple[Int64, Int64], first: int = 0) -> Self:
+        """The points of a map at (rows, columns); `first` is the index of its texel (0, 0)."""
+        return cls(
+            index=first + place[0] * texel_map.state.shape[1] + place[1],
+            position=texel_map.position[place],
+            normal=texel_map.normal[place],
+            shading_normal=texel_map.shading_normal[place],
+            alpha=texel_map.alpha[place],
+            texel_size=texel_map.texel_size[place],
+        )
 
 
 @dataclass(frozen=True)

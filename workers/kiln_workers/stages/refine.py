@@ -7,18 +7,17 @@ that of one block's images; a lost task is simply done again, and gives the same
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from kiln_schemas.conventions import FP16_MAX, LOBE_PARAMETERS, REFINE_HALO
-from kiln_schemas.settings import Function
+from kiln_schemas.conventions import FP16_MAX, REFINE_HALO
 from kiln_schemas.tasks import Block, RefinePayload, RefineResult, Tile
-from kiln_workers.fit.between import read_between
+from kiln_workers.fit.between import read_field
 from kiln_workers.fit.field import TexelField
+from kiln_workers.fit.lobes import amplitude_scale
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.solvers.joint import CoherentOptions, descend
 from kiln_workers.fit.source import valid_texels
@@ -38,10 +37,10 @@ def run(payload: RefinePayload, context: Context) -> RefineResult:
     began = time.perf_counter()
     block, steps = payload.block, payload.settings.fit.refine_steps
     texel_map = with_render_verdict(unpack_texel_map(context.blob(payload.texel_map)), payload.renders)
-    moved = tuple(unpack_texel_map(context.blob(digest)) for digest in payload.between)
     weights = Weights.from_bytes(context.blob(payload.fit.weights))
     store = LightFieldStore.open(payload.store_url)
-    field = _read_field(store, texel_map, moved, [r.tile for r in payload.renders], block, weights.exposure)
+    tiles = list(_wanted(texel_map, sorted((r.tile for r in payload.renders), key=lambda t: (t.row, t.column)), block))
+    field = read_field(store, texel_map, tiles, weights.exposure, lambda: _moved(payload, context))
     start = predict(weights, field.images, field.normals, threads=context.threads)
     found = start
     if weights.signal and len(field):
@@ -66,7 +65,7 @@ def read_lobes(data: bytes) -> tuple[tuple[npt.NDArray[np.int64], npt.NDArray[np
 def _descended(
     field: TexelField, start: Float32, options: CoherentOptions, payload: RefinePayload, context: Context
 ) -> Float32:
-    scale = torch.tensor([1.0] * (LOBE_PARAMETERS - 3) + [field.exposure] * 3)
+    scale = amplitude_scale(field.exposure)
     where = f"block {payload.block.row},{payload.block.column}"
 
     def on_step(step: int, _: torch.Tensor) -> None:
@@ -79,37 +78,12 @@ def _descended(
     return lobes
 
 
+def _moved(payload: RefinePayload, context: Context) -> tuple[TexelMap, ...]:
+    return tuple(unpack_texel_map(context.blob(digest)) for digest in payload.between)
+
+
 def _end(block: Block) -> tuple[int, int]:
     return block.row + block.size, block.column + block.size
-
-
-def _read_field(
-    store: LightFieldStore,
-    texel_map: TexelMap,
-    moved: tuple[TexelMap, ...],
-    tiles: list[Tile],
-    block: Block,
-    exposure: float,
-) -> TexelField:
-    """The valid texels within the block and its halo, and what was traced between them, tile by tile."""
-    places, images = [], []
-    ordered = sorted(tiles, key=lambda tile: (tile.row, tile.column))
-    for tile, inside in _wanted(texel_map, ordered, block):
-        places.append(np.stack(map_coordinates(tile, inside), axis=1))
-        images.append(store.read_tile(Function.LIGHT_FIELD, tile, inside))
-    size = store.image_size
-    place = np.concatenate([np.empty((0, 2), np.int64), *places])
-    at = place[:, 0], place[:, 1]
-    field = TexelField(
-        np.concatenate([np.empty((0, size, size, 3), np.float16), *images]),
-        texel_map.normal[at],
-        place,
-        texel_map.chart[at].astype(np.int64),
-        exposure,
-    )
-    if not moved or not len(field):
-        return field
-    return replace(field, traced=read_between(store, field, moved, _wanted(texel_map, ordered, block)))
 
 
 def _wanted(texel_map: TexelMap, tiles: list[Tile], block: Block) -> Iterator[tuple[Tile, npt.NDArray[np.int64]]]:

@@ -34,15 +34,7 @@ def run(payload: RenderPayload, context: Context) -> RenderResult:
     texel_map, tile = warm.texel_map, payload.tile
     inside = covered_texels(texel_map, tile)
     place = map_coordinates(tile, inside)
-    batch = TexelBatch(
-        index=place[0] * texel_map.state.shape[1] + place[1],
-        position=texel_map.position[place],
-        normal=texel_map.normal[place],
-        shading_normal=texel_map.shading_normal[place],
-        alpha=texel_map.alpha[place],
-        texel_size=texel_map.texel_size[place],
-    )
-
+    batch = TexelBatch.of(texel_map, place)
     share = 1.0 - BETWEEN_SHARE if warm.between else 1.0
 
     def on_progress(fraction: float) -> None:

@@ -16,6 +16,10 @@ class Neighbourhood:
         self._beside = torch.from_numpy(np.maximum(beside, 0))
         self.has_any = self._there.sum(dim=1) > 0.0  # [T]
 
+    def pull(self, axes: Tensor, weight: float) -> Tensor:
+        """Gradient [T, N, 3] of weight / N times the sum of |u - m|^2 by axes u, the neighbours' means m held fixed."""
+        return (2.0 * weight / axes.shape[1]) * (axes - self.mean_axes(axes))
+
     def mean_axes(self, axes: Tensor) -> Tensor:
         """[T, N, 3]: the mean of the neighbours' axes [T, N, 3], not normalised; a texel's own where it has none."""
         total = (axes[self._beside] * self._there[:, :, None, None]).sum(dim=1)

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kiln_workers.fit.field import TexelField
 from kiln_workers.fit.lobes import constrain
-from kiln_workers.fit.optimizer import BETA_1, BETA_2, one_cycle
+from kiln_workers.fit.optimizer import Moments, one_cycle
 from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, nobody
 from kiln_workers.fit.solvers.alignment import Neighbourhood
 from kiln_workers.fit.solvers.losses import texel_losses
@@ -61,7 +61,7 @@ def adam(
     pixels = PixelSet(field)
     normals = torch.from_numpy(field.normals)
     raw = (shared_start(field, lobes) if start is None else start).clone()
-    mean, square = torch.zeros_like(raw), torch.zeros_like(raw)
+    moments = Moments(raw, EPSILON)
     neighbourhood, trained = Neighbourhood(field), slice(*options.trained)
     for step in range(options.steps):
         variable = raw.detach().requires_grad_()
@@ -69,14 +69,10 @@ def adam(
         now = constrained.detach()
         gradient = _gradient(now, pixels, step if options.jitter else None)
         if options.alignment > 0.0:
-            away = now[..., :3] - neighbourhood.mean_axes(now[..., :3])
-            gradient[..., :3] += (2.0 * options.alignment / lobes) * away
+            gradient[..., :3] += neighbourhood.pull(now[..., :3], options.alignment)
         (by_raw,) = torch.autograd.grad(constrained, variable, gradient)
-        mean.lerp_(by_raw, 1.0 - BETA_1)
-        square.mul_(BETA_2).addcmul_(by_raw, by_raw, value=1.0 - BETA_2)
-        denominator = (square / (1.0 - BETA_2 ** (step + 1))).sqrt_().add_(EPSILON)
-        rate = one_cycle(step, options.steps, options.rate) / (1.0 - BETA_1 ** (step + 1))
-        move = (mean / denominator).mul_(rate)
+        mean, denominator, correction = moments.update(by_raw, step + 1)
+        move = (mean / denominator).mul_(one_cycle(step, options.steps, options.rate) / correction)
         raw[..., trained] -= move[..., trained]
         watch.tell(step + 1, partial(_represent, raw, normals))
     return Solution(_represent(raw, normals), options.steps, watch.seconds)

@@ -4,9 +4,9 @@ from typing import Final
 
 import torch
 
-from kiln_schemas.conventions import LOBE_PARAMETERS
 from kiln_schemas.settings import PRESETS, FitSettings, Function
 from kiln_workers.fit.field import TexelField
+from kiln_workers.fit.lobes import amplitude_scale
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, nobody
 from kiln_workers.fit.solvers.stopwatch import Stopwatch
@@ -48,4 +48,4 @@ def cnn(
 def _represent(field: TexelField, weights: Weights, threads: int) -> Lobes:
     """The network's lobes of all texels, exposure-normalised."""
     lobes = torch.from_numpy(predict(weights, field.images, field.normals, threads=threads))
-    return Lobes(lobes * torch.tensor([1.0] * (LOBE_PARAMETERS - 3) + [field.exposure] * 3))
+    return Lobes(lobes * amplitude_scale(field.exposure))

@@ -31,12 +31,12 @@ from kiln_workers.fit.field import TexelField, TracedBetween
 from kiln_workers.fit.lobes import constrain
 from kiln_workers.fit.metrics import horizon_weights
 from kiln_workers.fit.network import pixel_centres
-from kiln_workers.fit.optimizer import BETA_1, BETA_2, one_cycle
+from kiln_workers.fit.optimizer import Moments, one_cycle
 from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, mixed_lobes, nobody
 from kiln_workers.fit.solvers.alignment import Neighbourhood
 from kiln_workers.fit.solvers.encoder import SETTINGS, cnn
 from kiln_workers.fit.solvers.losses import texel_losses
-from kiln_workers.fit.solvers.pixels import Pixels, gather
+from kiln_workers.fit.solvers.pixels import Pixels, above_horizon, gather, split
 from kiln_workers.fit.solvers.starts import unconstrain
 from kiln_workers.fit.solvers.stopwatch import Stopwatch
 from kiln_workers.fit.source import Index
@@ -102,22 +102,20 @@ def descend(
         return start.clone()
     normals = torch.from_numpy(field.normals)
     with single_threaded_pool(threads) as pool:
-        problem = _Problem(field, pool)
+        problem, neighbourhood = _Problem(field, pool), Neighbourhood(field)
         raw = unconstrain(start, normals)
-        mean, square = torch.zeros_like(raw), torch.zeros_like(raw)
+        moments = Moments(raw, EPSILON)
         for step in range(options.steps):
             rng = np.random.default_rng([seed, _STREAM, step])
             fraction = step / options.steps
             alignment = options.alignment[0] * (options.alignment[1] / options.alignment[0]) ** fraction
             variable = raw.detach().requires_grad_()
             lobes = constrain(variable, normals)
-            gradient = problem.gradient(lobes.detach(), rng) + problem.alignment_gradient(lobes.detach(), alignment)
+            gradient = problem.gradient(lobes.detach(), rng)
+            gradient[..., :3] += neighbourhood.pull(lobes.detach()[..., :3], alignment)
             (by_raw,) = torch.autograd.grad(lobes, variable, gradient)
-            mean.lerp_(by_raw, 1.0 - BETA_1)
-            square.mul_(BETA_2).addcmul_(by_raw, by_raw, value=1.0 - BETA_2)
-            denominator = (square / (1.0 - BETA_2 ** (step + 1))).sqrt_().add_(EPSILON)
-            rate = one_cycle(step, options.steps, options.rate) / (1.0 - BETA_1 ** (step + 1))
-            raw.addcdiv_(mean, denominator, value=-rate)
+            mean, denominator, correction = moments.update(by_raw, step + 1)
+            raw.addcdiv_(mean, denominator, value=-one_cycle(step, options.steps, options.rate) / correction)
             on_step(step + 1, raw)
         return constrain(raw, normals)
 
@@ -126,13 +124,12 @@ class _Problem:
     """The loss of a field: its pixels, gathered once, and its gradient by lobes."""
 
     def __init__(self, field: TexelField, pool: ThreadPoolExecutor) -> None:
-        self._pool, self._field = pool, field
-        self._neighbourhood = Neighbourhood(field)
-        texels = _split(len(field), _TEXELS)
+        self._pool = pool
+        texels = split(len(field), _TEXELS)
         self._texels = list(zip(texels, pool.map(lambda part: gather(field, part), texels), strict=True))
         targets = field.traced if field.traced is not None else mean_targets(field)
         self._corners = torch.from_numpy(field.between.corners[targets.points])
-        points = _split(len(targets), _POINTS)
+        points = split(len(targets), _POINTS)
         found = pool.map(lambda part: _gather_between(field, targets, part), points)
         self._points = list(zip(points, found, strict=True))
 
@@ -146,13 +143,6 @@ class _Problem:
             by_mixed = torch.empty_like(mixed)
             self._add_up(by_mixed, mixed.detach(), self._points, BETWEEN_PIXELS, rng)
             out += torch.autograd.grad(mixed, variable, by_mixed)[0]
-        return out
-
-    def alignment_gradient(self, lobes: Tensor, weight: float) -> Tensor:
-        """[T, N, 7] of weight / N sum |u - m|^2, m held fixed."""
-        out = torch.zeros_like(lobes)
-        axes = lobes[..., :3]
-        out[..., :3] = (2.0 * weight / lobes.shape[1]) * (axes - self._neighbourhood.mean_axes(axes))
         return out
 
     def _add_up(
@@ -210,18 +200,4 @@ def _gather_between(field: TexelField, targets: TracedBetween, part: Index) -> P
     columns = 2 * np.arange(half)[None, None, :] + targets.offsets[part, 1][:, None, None]
     pixel = torch.from_numpy((rows * size + columns).reshape(len(part), -1))  # [B, K] of the whole image
     weights = 4.0 * horizon_weights(normals, size).gather(1, pixel)
-    most = int((weights > 0.0).sum(dim=1).max())
-    order = torch.argsort((weights <= 0.0).to(torch.int8), dim=1, stable=True)[:, :most]
-    images = torch.from_numpy(targets.images[part]).flatten(1, 2)
-    radiance = images.gather(1, order[..., None].expand(-1, -1, 3)).float()
-    return Pixels(
-        size,
-        pixel.gather(1, order).to(torch.int32),
-        weights.gather(1, order),
-        radiance.mul_(field.exposure).log1p_(),
-        normals,
-    )
-
-
-def _split(count: int, most: int) -> list[Index]:
-    return [np.arange(start, min(start + most, count), dtype=np.int64) for start in range(0, count, most)]
+    return above_horizon(size, pixel, weights, targets.images[part], field.exposure, normals)

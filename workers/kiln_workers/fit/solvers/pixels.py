@@ -16,7 +16,7 @@ from kiln_workers.fit.field import TexelField
 from kiln_workers.fit.loss import jittered_directions
 from kiln_workers.fit.metrics import horizon_weights
 from kiln_workers.fit.network import pixel_centres
-from kiln_workers.fit.source import Index
+from kiln_workers.fit.source import Float16, Index
 
 MEMORY_BYTES: Final = 256 << 20
 CHUNK: Final = 32
@@ -77,13 +77,29 @@ def gather(field: TexelField, chosen: Index) -> Pixels:
     size = field.image_size
     normals = torch.from_numpy(field.normals[chosen])
     weights = horizon_weights(normals, size)  # [T, R * R]
+    pixel = torch.arange(size * size).expand(len(chosen), -1)
+    return above_horizon(size, pixel, weights, field.images[chosen], field.exposure, normals)
+
+
+def above_horizon(
+    size: int, pixel: Tensor, weights: Tensor, images: Float16, exposure: float, normals: Tensor
+) -> Pixels:
+    """Of pixels [T, K] of images of `size` those whose weight [T, K] is not 0, in order.
+
+    `images` [T, r, r, 3] in scene units hold these K = r * r pixels.
+    """
     inside = weights > 0.0
     most = int(inside.sum(dim=1).max())
-    index = torch.argsort((~inside).to(torch.int8), dim=1, stable=True)[:, :most]
-    images = torch.from_numpy(field.images[chosen]).flatten(1, 2)
-    radiance = images.gather(1, index[..., None].expand(-1, -1, 3)).float()
-    log_targets = radiance.mul_(field.exposure).log1p_()
-    return Pixels(size, index.to(torch.int32), weights.gather(1, index), log_targets, normals)
+    order = torch.argsort((~inside).to(torch.int8), dim=1, stable=True)[:, :most]
+    flat = torch.from_numpy(images).flatten(1, 2)
+    radiance = flat.gather(1, order[..., None].expand(-1, -1, 3)).float()
+    log_targets = radiance.mul_(exposure).log1p_()
+    return Pixels(size, pixel.gather(1, order).to(torch.int32), weights.gather(1, order), log_targets, normals)
+
+
+def split(count: int, most: int) -> list[Index]:
+    """0 ... count - 1 in runs of at most `most`."""
+    return [np.arange(start, min(start + most, count), dtype=np.int64) for start in range(0, count, most)]
 
 
 class PixelSet:
@@ -91,9 +107,7 @@ class PixelSet:
 
     def __init__(self, field: TexelField, chunk: int = CHUNK) -> None:
         self._field = field
-        self.chunks: list[Index] = [
-            np.arange(start, min(start + chunk, len(field)), dtype=np.int64) for start in range(0, len(field), chunk)
-        ]
+        self.chunks = split(len(field), chunk)
         whole = len(field) * field.image_size**2 // 2 * _BYTES_PER_PIXEL
         self._kept: dict[int, Pixels] | None = {} if whole <= MEMORY_BYTES else None
 
