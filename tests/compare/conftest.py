@@ -1,13 +1,12 @@
 """A small kept bake: a room with a lamp, prepared and rendered by the real stages, packaged with lobes of its own."""
 
-import hashlib
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from e2e_farm import TINY, room
+from in_process import MemoryContext
 
 from kiln_schemas import conventions
 from kiln_schemas.manifest import Manifest, ManifestMetrics
@@ -27,46 +26,23 @@ from kiln_workers.store.light_field import LightFieldStore
 JOB = "0" * 32
 
 
-@dataclass
-class Memory:
-    """A `runner.context.Context` for the two stages."""
-
-    scratch: Path
-    blobs: dict[str, bytes] = field(default_factory=dict)
-    cache: dict[str, Any] = field(default_factory=dict)
-    memory_bytes: int = 1 << 28
-    threads: int = 1
-
-    def blob(self, sha256: str) -> bytes:
-        return self.blobs[sha256]
-
-    def put_blob(self, data: bytes) -> str:
-        digest = hashlib.sha256(data).hexdigest()
-        self.blobs[digest] = data
-        return digest
-
-    def progress(self, *_: Any, **__: Any) -> None: ...
-
-    def log(self, _: str) -> None: ...
-
-
 @pytest.fixture(scope="session")
 def kept_bake(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package's folder, with its store where `bake --keep` leaves it. Read only."""
     folder = tmp_path_factory.mktemp("compare") / "room"
     (folder / ".lightkiln" / "store").mkdir(parents=True)
-    context = Memory(folder / "scratch")
+    context = MemoryContext(folder / "scratch")
     context.scratch.mkdir()
     settings = make_settings("draft", [*TINY, "render.irradiance_samples=16", "render.samples=16"])
     url = f"file://{folder}/.lightkiln/store/{JOB}.zarr"
     bundle = Bundle(entry="room.glb", files={"room.glb": context.put_blob(encode_glb(room()))}, environment=None)
-    prepared = prepare.run(PreparePayload(bundle=bundle, settings=settings, store_url=url), context)  # type: ignore[arg-type]
+    prepared = prepare.run(PreparePayload(bundle=bundle, settings=settings, store_url=url), context)
     common: dict[str, Any] = {"settings": settings, "store_url": url}
     for tile in prepared.tiles:
         payload = RenderPayload(
             scene=prepared.scene, texel_map=prepared.texel_map, between=prepared.between, tile=tile, **common
         )
-        render.run(payload, context)  # type: ignore[arg-type]
+        render.run(payload, context)
     texel_map = unpack_texel_map(context.blob(prepared.texel_map))
     store = LightFieldStore.open(url)
     source = StoreSource(store, Function.LIGHT_FIELD, texel_map.state, texel_map.normal, prepared.tiles)

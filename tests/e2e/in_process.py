@@ -11,10 +11,15 @@ from kiln_schemas.tasks import (
     Bundle,
     EnvironmentRef,
     FitPayload,
+    FitResult,
     PackagePayload,
+    PackageResult,
     PreparePayload,
+    PrepareResult,
     RefinePayload,
+    RefineResult,
     RenderPayload,
+    RenderResult,
 )
 from kiln_service.planner import plan_blocks
 from kiln_workers.package.glb import encode_glb
@@ -64,18 +69,54 @@ class MemoryContext:
         self.messages.append(text)
 
 
-def bake(folder: Path, scene: Scene, settings: BakeSettings) -> Path:
-    """Bake a scene into `folder`; the package's folder. The store is `folder / "store.zarr"`."""
+@dataclass(frozen=True)
+class Baked:
+    """Everything that one bake handed on."""
+
+    context: MemoryContext
+    prepare_payload: PreparePayload
+    prepared: PrepareResult
+    renders: tuple[RenderResult, ...]
+    fits: tuple[FitResult, ...]
+    refine_payloads: tuple[RefinePayload, ...]
+    refines: tuple[RefineResult, ...]
+    packaged: PackageResult
+
+    def artifact(self, name: str) -> bytes:
+        (found,) = (a for a in self.packaged.artifacts if a.name == name)
+        return self.context.blobs[found.sha256]
+
+    def render_payload(self, index: int) -> RenderPayload:
+        return RenderPayload(
+            scene=self.prepared.scene,
+            texel_map=self.prepared.texel_map,
+            between=self.prepared.between,
+            tile=self.prepared.tiles[index],
+            settings=self.prepare_payload.settings,
+            store_url=self.prepare_payload.store_url,
+        )
+
+    def download(self, folder: Path) -> Path:
+        """The package in a folder, as a client has it."""
+        for artifact in self.packaged.artifacts:
+            (folder / artifact.name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / artifact.name).write_bytes(self.context.blobs[artifact.sha256])
+        return folder
+
+
+def bake(folder: Path, scene: Scene, settings: BakeSettings, **asked: Any) -> Baked:
+    """Bake a scene, the store being `folder / "store.zarr"`; `asked` are gates and cameras of the job."""
     context = MemoryContext(scratch=folder / "scratch")
     context.scratch.mkdir(parents=True)
-    files, environment = {"scene.glb": context.put_blob(encode_glb(scene))}, None
+    files, environment = {"room.glb": context.put_blob(encode_glb(scene))}, None
     if scene.environment is not None:
         write_exr(folder / "sky.exr", scene.environment.pixels)
         files["sky.exr"] = context.put_blob(folder / "sky.exr")
         environment = EnvironmentRef(file="sky.exr")
-    bundle = Bundle(entry="scene.glb", files=files, environment=environment)
+    bundle = Bundle(entry="room.glb", files=files, environment=environment)
     common: dict[str, Any] = {"settings": settings, "store_url": (folder / "store.zarr").absolute().as_uri()}
-    prepared = prepare.run(PreparePayload(bundle=bundle, **common), context)
+    payload = PreparePayload(bundle=bundle, **common)
+    prepared = prepare.run(payload, context)
     maps: dict[str, Any] = {"texel_map": prepared.texel_map, **common}
     placed: dict[str, Any] = {"between": prepared.between, **maps}
     renders = tuple(
@@ -83,24 +124,23 @@ def bake(folder: Path, scene: Scene, settings: BakeSettings) -> Path:
     )
     functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if environment else [])
     fits = tuple(fit.run(FitPayload(function=f, renders=renders, **maps), context) for f in functions)
-    refines = tuple(
-        refine.run(RefinePayload(block=block, renders=renders, fit=fits[0], **placed), context)
+    refine_payloads = tuple(
+        RefinePayload(block=block, renders=renders, fit=fits[0], **placed)
         for block in plan_blocks(prepared.tiles, settings)
     )
+    refines = tuple(refine.run(each, context) for each in refine_payloads)
     packaged = package.run(
         PackagePayload(
             job_id="0" * 32,
-            job_name="test",
+            job_name="room",
             bundle=bundle,
             prepare=prepared,
             renders=renders,
             fits=fits,
             refines=refines,
+            **asked,
             **common,
         ),
         context,
     )
-    for artifact in packaged.artifacts:
-        (folder / "package" / artifact.name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / "package" / artifact.name).write_bytes(context.blobs[artifact.sha256])
-    return folder / "package"
+    return Baked(context, payload, prepared, renders, fits, refine_payloads, refines, packaged)

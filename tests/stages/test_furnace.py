@@ -49,11 +49,8 @@ def enclosure() -> Scene:
 @pytest.fixture(scope="module")
 def furnace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("furnace")
-    bake(
-        folder,
-        enclosure(),
-        make_settings("draft", [*TINY, "fit.refine_steps=400", "render.samples=2", *NO_SCATTERING]),
-    )
+    settings = make_settings("draft", [*TINY, "fit.refine_steps=400", "render.samples=2", *NO_SCATTERING])
+    bake(folder, enclosure(), settings).download(folder / "package")
     return folder
 
 
@@ -98,7 +95,9 @@ def test_a_ball_in_a_constant_environment(tmp_path: Path) -> None:
     white = Material("white metal", (1.0, 1.0, 1.0, 1.0), metallic=1.0, roughness=0.6)
     environment = Environment(np.full((8, 16, 3), 0.8, np.float32))
     settings = make_settings("draft", [*TINY, "fit.visibility_steps=1000"])
-    package = read(bake(tmp_path, Scene((ball,), (white,), environment=environment), settings))
+    package = read(
+        bake(tmp_path, Scene((ball,), (white,), environment=environment), settings).download(tmp_path / "package")
+    )
     store = LightFieldStore.open((tmp_path / "store.zarr").as_uri())
     texels = store.read_texel_map()
     assert package.lobes.visibility_lobes is not None
@@ -149,7 +148,7 @@ def test_a_mirrored_scene_gives_the_mirrored_picture(tmp_path: Path) -> None:
     straight = replace(room(), environment=Environment(pixels))
     pictures = []
     for name, scene, side in (("one", straight, 1.0), ("other", mirrored(room(), Environment(pixels)), -1.0)):
-        package = read(bake(tmp_path / name, scene, settings))
+        package = read(bake(tmp_path / name, scene, settings).download(tmp_path / name / "package"))
         camera = Camera(position=(side * 0.4, 1.1, 3.6), target=(0.0, 0.8, -0.5), fov_deg=42.0)
         pictures.append(shade(package, render_gbuffer(package.scene, camera, 48, 36, device="cpu")))
     one, other = (np.log1p(picture.astype(np.float64)) for picture in pictures)

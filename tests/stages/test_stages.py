@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 from e2e_farm import TINY, room, sky
-from in_process import MemoryContext
+from in_process import Baked, MemoryContext, bake
 
 from kiln_schemas.camera import Camera
 from kiln_schemas.errors import Canceled, InputError
@@ -20,19 +20,8 @@ from kiln_schemas.gates import Gates
 from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import Function, make_settings
 from kiln_schemas.tasks import (
-    Block,
     Bundle,
-    EnvironmentRef,
-    FitPayload,
-    FitResult,
     PackagePayload,
-    PackageResult,
-    PreparePayload,
-    PrepareResult,
-    RefinePayload,
-    RefineResult,
-    RenderPayload,
-    RenderResult,
 )
 from kiln_workers.fit.metrics import TexelErrors, texel_errors
 from kiln_workers.fit.predict import Weights, predict
@@ -41,14 +30,14 @@ from kiln_workers.package.exr import write_rgb
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.package.half import layers_to_lobes
 from kiln_workers.scene.archive import unpack_scene
-from kiln_workers.scene.examples import write_exr
+from kiln_workers.scene.model import Environment
 from kiln_workers.scene.texel_map import TexelState, unpack_texel_map
 from kiln_workers.shade.gbuffer import render_gbuffer
 from kiln_workers.shade.image_metrics import flip
 from kiln_workers.shade.package import ShadePackage, read_manifest
 from kiln_workers.shade.picture import shade
 from kiln_workers.shade.reference import path_trace
-from kiln_workers.stages import fit, gates, package, prepare, refine, render
+from kiln_workers.stages import gates, prepare, refine, render
 from kiln_workers.stages.tiles import covered_texels, map_coordinates, plan_tiles, with_render_verdict
 from kiln_workers.store.layout import BETWEEN_STEPS
 from kiln_workers.store.light_field import LightFieldStore
@@ -58,88 +47,11 @@ GATES = Gates(log_mse_rel=1e-6, visibility_log_mse_rel=0.5, flip={"front": 0.6})
 """One that is missed and two that are met; the loose one makes do with few paths."""
 
 
-@dataclass(frozen=True)
-class Baked:
-    """Everything that one bake handed on."""
-
-    context: MemoryContext
-    prepare_payload: PreparePayload
-    prepared: PrepareResult
-    renders: tuple[RenderResult, ...]
-    fits: tuple[FitResult, ...]
-    refine_payloads: tuple[RefinePayload, ...]
-    refines: tuple[RefineResult, ...]
-    packaged: PackageResult
-
-    def artifact(self, name: str) -> bytes:
-        (found,) = (a for a in self.packaged.artifacts if a.name == name)
-        return self.context.blobs[found.sha256]
-
-    def render_payload(self, index: int) -> RenderPayload:
-        return RenderPayload(
-            scene=self.prepared.scene,
-            texel_map=self.prepared.texel_map,
-            between=self.prepared.between,
-            tile=self.prepared.tiles[index],
-            settings=self.prepare_payload.settings,
-            store_url=self.prepare_payload.store_url,
-        )
-
-
 @pytest.fixture(scope="module")
 def baked(tmp_path_factory: pytest.TempPathFactory) -> Baked:
-    folder = tmp_path_factory.mktemp("stages")
-    context = MemoryContext(scratch=folder / "scratch")
-    context.scratch.mkdir()
-    write_exr(folder / "sky.exr", sky())
-    files = {"room.glb": context.put_blob(encode_glb(room())), "sky.exr": context.put_blob(folder / "sky.exr")}
-    bundle = Bundle(entry="room.glb", files=files, environment=EnvironmentRef(file="sky.exr"))
+    scene = replace(room(), environment=Environment(sky()))
     settings = make_settings("draft", TINY)
-    url = f"file://{folder}/store.zarr"
-    asked = PreparePayload(bundle=bundle, settings=settings, store_url=url)
-    prepared = prepare.run(asked, context)
-    common: dict[str, Any] = {"settings": settings, "store_url": url}
-    renders = tuple(
-        render.run(
-            RenderPayload(
-                scene=prepared.scene, texel_map=prepared.texel_map, between=prepared.between, tile=tile, **common
-            ),
-            context,
-        )
-        for tile in prepared.tiles
-    )
-    fits = tuple(
-        fit.run(FitPayload(function=f, texel_map=prepared.texel_map, renders=renders, **common), context)
-        for f in Function
-    )
-    refine_payloads = tuple(
-        RefinePayload(
-            block=Block(row=row, column=column, size=8),
-            texel_map=prepared.texel_map,
-            between=prepared.between,
-            renders=renders,
-            fit=fits[0],
-            **common,
-        )
-        for row, column in ((0, 0), (0, 8), (8, 0), (8, 8))
-    )
-    refines = tuple(refine.run(payload, context) for payload in refine_payloads)
-    packaged = package.run(
-        PackagePayload(
-            job_id="j",
-            job_name="room",
-            bundle=bundle,
-            prepare=prepared,
-            renders=renders,
-            fits=fits,
-            refines=refines,
-            gates=GATES,
-            cameras={"front": FRONT},
-            **common,
-        ),
-        context,
-    )
-    return Baked(context, asked, prepared, renders, fits, refine_payloads, refines, packaged)
+    return bake(tmp_path_factory.mktemp("stages"), scene, settings, gates=GATES, cameras={"front": FRONT})
 
 
 def _valid(baked: Baked, function: Function) -> Iterator[tuple[tuple[Any, Any], Any, Any]]:
@@ -265,11 +177,7 @@ def test_a_dark_scene_is_refused(baked: Baked) -> None:
 @pytest.fixture(scope="module")
 def downloaded(baked: Baked, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package as a client has it."""
-    folder = tmp_path_factory.mktemp("downloaded")
-    for artifact in baked.packaged.artifacts:
-        (folder / artifact.name).parent.mkdir(exist_ok=True)
-        (folder / artifact.name).write_bytes(baked.context.blobs[artifact.sha256])
-    return folder
+    return baked.download(tmp_path_factory.mktemp("downloaded"))
 
 
 def test_gates_are_in_the_result_the_manifest_and_the_files(baked: Baked, downloaded: Path) -> None:
