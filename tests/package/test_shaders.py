@@ -32,6 +32,6 @@ def test_each_include_needs_only_those_before_it(name: str, node_tools, tmp_path
 def test_the_compiler_would_notice_a_mistake(node_tools, tmp_path: Path) -> None:
     path = tmp_path / "broken.frag"
     program = shaders.fragment_program(environment=True)
-    assert "lkConvolve(lkFetchLobe" in program
-    path.write_text(program.replace("lkConvolve(lkFetchLobe", "lkConvolve(nothing"))
+    assert "lkMeanUnder(lkFetchLobe" in program
+    path.write_text(program.replace("lkMeanUnder(lkFetchLobe", "lkMeanUnder(nothing"))
     assert node_tools.glslang(path).returncode != 0

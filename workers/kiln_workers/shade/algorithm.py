@@ -2,11 +2,11 @@
 
     diffuse           E albedo (1 - metallic) T(o.n) / pi
     interreflection   sum over lobes of the mean of the lobe under K, times R(o.n)                   (steps 3 to 6)
-    environment       U(z, alpha) W_E(z), over the integral of D, times R(o.n), z the axis of K       (eq. 8)
+    environment       U(z, alpha) W_E(z), over the integral of D, times R(o.n), z the mean axis of K  (eq. 8)
 
 The paper takes D as an anisotropic Gaussian over light directions (eq. 17 and 18), and F and G at the specular
 direction r. So what a surface reflects of constant light is wrong by up to a half, and of other light by more where it
-is rough and seen from the side. Here light is a mean under K, an anisotropic Gaussian fitted to D G (n.i) as a whole,
+is rough and seen from the side. Here light is a mean under K, two anisotropic Gaussians fitted to D G (n.i) as a whole,
 and R is the single-scattering albedo of the microfacet model (Karis 2013, "split sum"), so that constant light is
 reflected as it should be for any alpha and angle; T is the mean of 1 - F over the hemisphere in the place of
 1 - F(o.n). All three are fits to quadrature, which the tests repeat. `paper_kernel`, `convolved` and `paper_factor`
@@ -15,7 +15,8 @@ Formulas that the paper misprints are the corrected ones of `sphere.anisotropic`
 module. Letters: n normal, o to the eye, r specular direction, D, F, G the microfacet terms, nu half a lobe's sharpness.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from math import pi
 
 import torch
@@ -41,18 +42,19 @@ ALBEDO_FIT = (
 DIFFUSE_FIT = (0.95903, 0.02659)
 
 KERNEL_FIT = (
-    (2.2033, 2.8916, -0.97613),
-    (-5.7166, -5.0691, 0.7319),
-    (3.9747, -3.1406, 0.98899),
-    (-3.3405, -3.5273, -2.3086),
-    (-3.3991, 7.2016, 2.8365),
-    (0.99922, -1.4864, -0.35477),
-    (-2.101, -2.7828, -6.2307),
-    (-1.6886, 2.7302, -1.9223),
-    (-2.9847, 1.3919, 1.5315),
-    (-0.4911, 0.63876, -0.85262),
+    (3.6777, 5.49, -0.021158, 1.9791, 0.73549, -2.9924, -0.99093),
+    (-19.753, -13.842, 0.30818, -22.82, -18.607, 4.7089, 2.776),
+    (2.9478, -10.454, 0.091509, 8.3079, 1.2791, 5.0207, -1.9232),
+    (37.346, 19.454, 6.2794, 29.596, 17.517, -17.214, 2.508),
+    (-9.1963, 24.932, 6.1928, -16.878, 29.174, 15.763, -4.0843),
+    (10.519, 5.7541, -1.8453, -12.738, -12.391, -12.476, 1.8806),
+    (-19.014, -11.536, -3.5664, -18.206, -3.9007, 7.7688, -2.5371),
+    (-3.1945, -10.719, -4.4632, 14.61, -21.17, 2.3152, 7.7452),
+    (6.0982, -12.137, -6.0564, 4.2414, -7.5434, -15.977, -1.8843),
+    (-10.127, -0.65908, 1.8442, 8.5499, 8.1529, 8.179, 0.41033),
 )
-"""Tilt and logarithms of both sharpnesses by 1, y, x, yy, yx, xx, yyy, yyx, yxx, xxx; made by benchmarks/kernel.py."""
+"""Of peak and tail the tilt and the logarithms of both sharpnesses, and the logit of the tail's share, by 1, y, x, yy,
+yx, xx, yyy, yyx, yxx, xxx with x = o.n and y = alpha; made by benchmarks/kernel.py."""
 
 
 @dataclass(frozen=True)
@@ -87,38 +89,69 @@ class Kernel:
     ly: Tensor  # [P]
     amplitude: Tensor  # [P]
 
+    @property
+    def integral(self) -> Tensor:
+        """Over the sphere [P], as `_cap` has it."""
+        return self.amplitude * _cap(self.lx, self.ly)
+
+    def __getitem__(self, points: Tensor) -> "Kernel":
+        """Those of some of the points."""
+        return Kernel(*(getattr(self, field.name)[points] for field in fields(self)))
+
     def __call__(self, directions: Tensor) -> Tensor:
         """Values [P, K] in directions [K, 3]."""
         across = self.lx[:, None] * (self.x @ directions.T) ** 2 + self.ly[:, None] * (self.y @ directions.T) ** 2
         return self.amplitude[:, None] * (self.z @ directions.T).clamp(min=0.0) * torch.exp(-across)
 
 
-def reflection_kernel(surface: Surface) -> Kernel:
-    """K: D G (n.i) seen from o as an anisotropic Gaussian whose integral over the sphere is 1.
+def reflection_kernels(surface: Surface) -> tuple[Kernel, Kernel]:
+    """K: D G (n.i) seen from o as two anisotropic Gaussians, its peak and its tail, whose integrals add up to 1.
 
-    Its axis leaves the specular direction for the normal as the surface gets rougher and the view lower, and it is
-    wider than eq. 18 has it there. Tilt and sharpnesses are polynomials in o.n and alpha, fitted to the normalised
-    microfacet lobe by the Hellinger distance, whose mean square is 0.10 (eq. 18: 0.27).
+    Their axes leave the specular direction for the normal as the surface gets rougher and the view lower, and they are
+    wider than eq. 18 has it there. Tilts, sharpnesses and shares are polynomials in o.n and alpha, fitted to the
+    normalised microfacet lobe by the Hellinger distance, whose mean square is 0.03 (one Gaussian 0.11, eq. 18 0.27).
     """
     x, y = surface.cosine, surface.alpha.clamp(ALBEDO_LEAST_ALPHA, 1.0)
     terms = torch.stack([torch.ones_like(x), y, x, y * y, y * x, x * x, y**3, y * y * x, y * x * x, x**3], dim=-1)
-    tilt, log_x, log_y = (terms @ terms.new_tensor(KERNEL_FIT)).unbind(-1)
-    lx, ly = (torch.exp(log) / (4.0 * y * y) for log in (log_x, log_y))
-    z = torch.nn.functional.normalize(
-        torch.lerp(surface.normal, surface.specular, torch.sigmoid(tilt)[:, None]), dim=-1
+    fit = terms @ terms.new_tensor(KERNEL_FIT)
+    across, tail = _across(surface), torch.sigmoid(fit[:, 6])
+    return (
+        _gaussian(surface, across, fit[:, :3], y, 1.0 - tail),
+        _gaussian(surface, across, fit[:, 3:6], y, tail),
     )
-    across = _across(surface)
-    return Kernel(across, torch.linalg.cross(z, across), z, lx, ly, 1.0 / _cap(lx, ly))
 
 
-def mean_under(lobes: Tensor, kernel: Kernel) -> Tensor:
-    """Mean of each point's lobes [P, N, 7] under its kernel [P, 3].
+def _gaussian(surface: Surface, across: Tensor, fit: Tensor, alpha: Tensor, integral: Tensor) -> Kernel:
+    """A kernel of the given integral [P] from its tilt and the logarithms of its sharpnesses [P, 3]."""
+    tilt = torch.sigmoid(fit[:, :1])
+    z = torch.nn.functional.normalize(torch.lerp(surface.normal, surface.specular, tilt), dim=-1)
+    lx, ly = (torch.exp(fit[:, 1:]) / (4.0 * alpha * alpha)[:, None]).unbind(-1)
+    return Kernel(across, torch.linalg.cross(z, across), z, lx, ly, integral / _cap(lx, ly))
+
+
+def glossy_direction(surface: Surface) -> Tensor:
+    """Where a surface gathers most of its light from [P, 3]: the mean axis of its kernels by their shares.
+
+    The specular direction of a mirror; nearer to the normal for a rough surface seen from the side. Lagarde and de
+    Rousiers 2014 call it the dominant direction.
+    """
+    kernels = reflection_kernels(surface)
+    mean = sum((kernel.z * kernel.integral[:, None] for kernel in kernels), torch.zeros_like(surface.normal))
+    return torch.nn.functional.normalize(mean, dim=-1)
+
+
+def mean_under(lobes: Tensor, kernels: Sequence[Kernel]) -> Tensor:
+    """Mean of each point's lobes [P, N, 7] under kernels whose integrals add up to 1: [P, 3].
 
     The product of two Gaussians, as in eq. 24 corrected, but sound for wide ones too: distances are chords, as in a
     spherical Gaussian's own exponent, so what lies behind is far away; the cosine is taken at the product's centre;
-    and what remains is integrated over the hemisphere about it instead of the plane (`_cap`). Against quadrature of the
-    kernel: 11 % rms over sharpnesses 0.4 to 50 and alpha 0.1 to 0.7 (eq. 24: 65 %, nearly all of it too dark).
+    and what remains is integrated over the hemisphere about it instead of the plane (`_cap`).
     """
+    return sum((_product(lobes, kernel) for kernel in kernels), torch.zeros_like(lobes[:, 0, 4:]))
+
+
+def _product(lobes: Tensor, kernel: Kernel) -> Tensor:
+    """Integral of the lobes times one kernel [P, 3]."""
     nu, lx, ly = 0.5 * lobes[..., 3], kernel.lx[:, None], kernel.ly[:, None]
     x, y, z = ((lobes[..., :3] * axis[:, None]).sum(-1) for axis in (kernel.x, kernel.y, kernel.z))
     chord = 2.0 / (1.0 + z).clamp(min=1e-2)

@@ -40,7 +40,7 @@ class Incident(Protocol):
     """The light that arrives at P points of the light map: uv [P, 2]."""
 
     def reflected(self, uv: Tensor, surface: algorithm.Surface, paper: bool = False) -> Tensor:
-        """Mean of the light field under the surface's kernel [P, 3]; `paper`: its integral times D."""
+        """Mean of the light field under the surface's kernels [P, 3]; `paper`: its integral times D."""
         ...
 
     def visibility(self, uv: Tensor, directions: Tensor) -> Tensor:
@@ -59,7 +59,7 @@ class LobeTextures:
         lobes = algorithm.unit_lobes(textures.bilinear(self.light_field, uv))
         if paper:
             return algorithm.convolved(lobes, algorithm.paper_kernel(surface))
-        return algorithm.mean_under(lobes, algorithm.reflection_kernel(surface))
+        return algorithm.mean_under(lobes, algorithm.reflection_kernels(surface))
 
     def visibility(self, uv: Tensor, directions: Tensor) -> Tensor:
         if self.visibility_lobes is None:

@@ -26,7 +26,7 @@ def shade(
 ) -> Float32:
     """Radiance [H, W, 3], the sum of `terms`; glossy light from `incident`, by default the package's lobes.
 
-    `paper`: D, F and G as the paper has them, instead of a fitted kernel and the albedo of GGX.
+    `paper`: D, F and G as the paper has them, instead of fitted kernels and the albedo of GGX.
     """
     height, width, samples = buffer.hit.shape
     out = np.zeros((height * width * samples, 3), np.float32)
@@ -63,7 +63,7 @@ def _shade_points(
         radiance += incident.reflected(uv, surface, paper) * factor
     reflected = {Term.ENVIRONMENT, *COMPARED} & set(terms)
     if package.environment is not None and reflected:
-        towards = surface.specular if paper else algorithm.reflection_kernel(surface).z
+        towards = surface.specular if paper else algorithm.glossy_direction(surface)
         u = package.environment.convolved(towards, surface.alpha)
         seen: Tensor | float = 1.0
         if Term.ENVIRONMENT in reflected:

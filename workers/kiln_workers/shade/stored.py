@@ -1,8 +1,8 @@
 """Incident light from the light-field store instead of the lobes: the algorithm as it were if the fit were perfect.
 
-The same section 6, with D still an anisotropic Gaussian and F and G still at the specular direction, but the integral
-over the light field a sum over its stored pixels, and W_E looked up in its stored image. What remains against a path
-tracer is the algorithm's error; what the lobes add to it is the fit's. Tiles are read one at a time: memory is bounded.
+The same section 6 with the same kernels and albedo, but the integral over the light field a sum over its stored pixels,
+and W_E looked up in its stored image. What remains against a path tracer is the algorithm's error; what the lobes add
+to it is the fit's. Tiles are read one at a time: memory is bounded.
 """
 
 from collections.abc import Iterator
@@ -46,7 +46,7 @@ class StoredImages:
         return cls(store, store.read_texel_map()["state"] == VALID)
 
     def reflected(self, uv: Tensor, surface: algorithm.Surface, paper: bool = False) -> Tensor:
-        kernel = algorithm.paper_kernel(surface) if paper else algorithm.reflection_kernel(surface)
+        kernels = (algorithm.paper_kernel(surface),) if paper else algorithm.reflection_kernels(surface)
         size = self.store.image_size
         directions = torch.from_numpy(octahedral.pixel_directions(size).reshape(-1, 3)).to(uv)
         solid_angles = torch.from_numpy(octahedral.pixel_solid_angles(size).reshape(-1, 1).copy()).to(uv)
@@ -56,10 +56,8 @@ class StoredImages:
             light = image.reshape(-1, 3) * solid_angles
             for part in torch.split(torch.arange(len(point), device=uv.device), step):
                 at = point[part]
-                chosen = algorithm.Kernel(
-                    *(getattr(kernel, name)[at] for name in ("x", "y", "z", "lx", "ly", "amplitude"))
-                )
-                out.index_add_(0, at, weight[part, None] * (chosen(directions) @ light))
+                for kernel in kernels:
+                    out.index_add_(0, at, weight[part, None] * (kernel[at](directions) @ light))
         return out
 
     def visibility(self, uv: Tensor, directions: Tensor) -> Tensor:

@@ -52,18 +52,19 @@ vec3 lkReflectance(LkSurface surface, vec3 o) {
   return lkF0(surface) * ab.x + ab.y;
 }
 
-// Glossy reflection of the scene: each lobe of the light field convolved with D (steps 3 to 6 of section 6).
+// Glossy reflection of the scene: the mean of each lobe of the light field under D G (n.i) (steps 3 to 6 of section 6).
 vec3 lkInterreflection(sampler2DArray lightField, int count, vec2 uv, LkSurface surface, vec3 o) {
-  LkAnisotropicLobe kernel = lkReflectionLobe(surface.normal, o, surface.roughness * surface.roughness);
+  LkReflection reflection = lkReflection(surface.normal, o, surface.roughness * surface.roughness);
   vec3 sum = vec3(0.0);
-  for (int k = 0; k < count; k++) sum += lkConvolve(lkFetchLobe(lightField, uv, k), kernel);
+  for (int k = 0; k < count; k++) sum += lkMeanUnder(lkFetchLobe(lightField, uv, k), reflection);
   return sum * lkReflectance(surface, o);
 }
 
 // Where a glossy surface gathers most of its light from: the specular direction of a mirror, nearer to the normal for a
 // rough surface seen from the side (Lagarde and de Rousiers 2014 call it the dominant direction).
 vec3 lkGlossyDirection(LkSurface surface, vec3 o) {
-  return lkReflectionLobe(surface.normal, o, surface.roughness * surface.roughness).z;
+  LkReflection reflection = lkReflection(surface.normal, o, surface.roughness * surface.roughness);
+  return normalize(mix(reflection.peak.z, reflection.tail.z, reflection.tailShare));
 }
 
 // Glossy reflection of the environment: U over the integral of D, 4 / (1 + alpha^2), times visibility and albedo (eq. 8).

@@ -59,34 +59,60 @@ float lkCap(vec2 s) {
   return LK_PI * sqrt(lkSaturated(s.x) * lkSaturated(s.y));
 }
 
-// What a GGX surface of width alpha gathers light with, D G (n.i), seen from the unit direction o: an anisotropic
-// Gaussian whose integral is 1. Its axis leaves the specular direction for the normal as alpha grows and the view
-// lowers; tilt and sharpnesses are polynomials in o.n and alpha, fitted to the microfacet model. The paper's eq. 17 and
-// 18 (Wang et al. 2009) hold for smooth surfaces seen from above only. x is perpendicular to the plane of incidence.
-LkAnisotropicLobe lkReflectionLobe(vec3 n, vec3 o, float alpha) {
+// What a GGX surface of width alpha gathers light with, D G (n.i) normalised: two lobes whose integrals add up to 1.
+struct LkReflection {
+  LkAnisotropicLobe peak;
+  LkAnisotropicLobe tail;
+  float tailShare;
+};
+
+// A lobe of a reflection from its tilt and the logarithms of its sharpnesses.
+LkAnisotropicLobe lkReflectionLobe(vec3 n, vec3 specular, vec3 across, vec3 fit, float alpha, float integral) {
+  LkAnisotropicLobe lobe;
+  lobe.x = across;
+  lobe.z = normalize(mix(n, specular, 1.0 / (1.0 + exp(-fit.x))));
+  lobe.y = cross(lobe.z, lobe.x);
+  lobe.sharpness = exp(fit.yz) / (4.0 * alpha * alpha);
+  lobe.amplitude = integral / lkCap(lobe.sharpness);
+  return lobe;
+}
+
+// The reflection of a GGX surface seen from the unit direction o. Its lobes' axes leave the specular direction for the
+// normal as alpha grows and the view lowers; tilts, sharpnesses and shares are polynomials in o.n and alpha, fitted to the
+// microfacet model. The paper's eq. 17 and 18 (Wang et al. 2009) hold for smooth surfaces seen from above only.
+LkReflection lkReflection(vec3 n, vec3 o, float alpha) {
   float x = clamp(dot(n, o), 1e-4, 1.0);
   float y = clamp(alpha, 0.04, 1.0);
-  vec3 fit = vec3(2.2033, 2.8916, -0.97613);
-  fit += vec3(-5.7166, -5.0691, 0.7319) * (y);
-  fit += vec3(3.9747, -3.1406, 0.98899) * (x);
-  fit += vec3(-3.3405, -3.5273, -2.3086) * (y * y);
-  fit += vec3(-3.3991, 7.2016, 2.8365) * (y * x);
-  fit += vec3(0.99922, -1.4864, -0.35477) * (x * x);
-  fit += vec3(-2.101, -2.7828, -6.2307) * (y * y * y);
-  fit += vec3(-1.6886, 2.7302, -1.9223) * (y * y * x);
-  fit += vec3(-2.9847, 1.3919, 1.5315) * (y * x * x);
-  fit += vec3(-0.4911, 0.63876, -0.85262) * (x * x * x);
+  vec3 peak = vec3(3.6777, 5.49, -0.021158);
+  peak += vec3(-19.753, -13.842, 0.30818) * (y);
+  peak += vec3(2.9478, -10.454, 0.091509) * (x);
+  peak += vec3(37.346, 19.454, 6.2794) * (y * y);
+  peak += vec3(-9.1963, 24.932, 6.1928) * (y * x);
+  peak += vec3(10.519, 5.7541, -1.8453) * (x * x);
+  peak += vec3(-19.014, -11.536, -3.5664) * (y * y * y);
+  peak += vec3(-3.1945, -10.719, -4.4632) * (y * y * x);
+  peak += vec3(6.0982, -12.137, -6.0564) * (y * x * x);
+  peak += vec3(-10.127, -0.65908, 1.8442) * (x * x * x);
+  vec4 tail = vec4(1.9791, 0.73549, -2.9924, -0.99093);
+  tail += vec4(-22.82, -18.607, 4.7089, 2.776) * (y);
+  tail += vec4(8.3079, 1.2791, 5.0207, -1.9232) * (x);
+  tail += vec4(29.596, 17.517, -17.214, 2.508) * (y * y);
+  tail += vec4(-16.878, 29.174, 15.763, -4.0843) * (y * x);
+  tail += vec4(-12.738, -12.391, -12.476, 1.8806) * (x * x);
+  tail += vec4(-18.206, -3.9007, 7.7688, -2.5371) * (y * y * y);
+  tail += vec4(14.61, -21.17, 2.3152, 7.7452) * (y * y * x);
+  tail += vec4(4.2414, -7.5434, -15.977, -1.8843) * (y * x * x);
+  tail += vec4(8.5499, 8.1529, 8.179, 0.41033) * (x * x * x);
   vec3 specular = 2.0 * dot(n, o) * n - o;
-  LkAnisotropicLobe lobe;
-  lobe.z = normalize(mix(n, specular, 1.0 / (1.0 + exp(-fit.x))));
-  // Looking along the normal both sharpnesses agree, and any frame about z will do.
+  // Perpendicular to the plane of incidence; looking along the normal any frame about z will do.
   vec3 across = cross(n, specular);
   vec3 other = abs(specular.y) < 0.9 ? vec3(0.0, 1.0, 0.0) : vec3(1.0, 0.0, 0.0);
-  lobe.x = normalize(dot(across, across) > 1e-10 ? across : cross(other, specular));
-  lobe.y = cross(lobe.z, lobe.x);
-  lobe.sharpness = exp(fit.yz) / (4.0 * y * y);
-  lobe.amplitude = 1.0 / lkCap(lobe.sharpness);
-  return lobe;
+  across = normalize(dot(across, across) > 1e-10 ? across : cross(other, specular));
+  LkReflection reflection;
+  reflection.tailShare = 1.0 / (1.0 + exp(-tail.w));
+  reflection.peak = lkReflectionLobe(n, specular, across, peak, y, 1.0 - reflection.tailShare);
+  reflection.tail = lkReflectionLobe(n, specular, across, tail.xyz, y, reflection.tailShare);
+  return reflection;
 }
 
 // Integral over the sphere of a lobe times an anisotropic lobe: eq. 24, corrected (the Gaussian is evaluated at the lobe's
@@ -104,4 +130,9 @@ vec3 lkConvolve(LkLobe lobe, LkAnisotropicLobe kernel) {
   float centre = (nu * z + width) * inversesqrt(max(nu * nu + width * width + 2.0 * nu * width * z, 1e-9));
   float overlap = lkCap(sum) * clamp(centre, 0.0, 1.0) * exp(-(reduced.x * x * x + reduced.y * y * y) * chord);
   return lobe.amplitude * kernel.amplitude * overlap;
+}
+
+// The mean of a lobe under a reflection.
+vec3 lkMeanUnder(LkLobe lobe, LkReflection reflection) {
+  return lkConvolve(lobe, reflection.peak) + lkConvolve(lobe, reflection.tail);
 }
