@@ -76,7 +76,8 @@ class FitSettings(Contract):
 
     solver: Solver = Solver.COHERENT
     lobes: int = Field(ge=1, le=64, description="spherical Gaussians per texel")
-    steps: int = Field(ge=1, le=1_000_000, description="optimiser steps of the light field's network")
+    steps: int = Field(ge=1, le=1_000_000, description="optimiser steps of the light field's network, used as it is")
+    start_steps: int = Field(default=800, ge=1, le=1_000_000, description="the same where the coherent descent follows")
     visibility_steps: int = Field(default=1000, ge=1, le=1_000_000, description="of the visibility's: it is far easier")
     batch: int = Field(default=32, ge=1, le=1024, description="texels per step")
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
@@ -84,6 +85,12 @@ class FitSettings(Contract):
     refine_steps: int = Field(default=600, ge=1, le=1_000_000, description="steps of the coherent descent")
     block: int = Field(default=32, ge=8, le=256, description="texels along each side of a refine task's block")
     checkpoint_s: float = Field(default=60.0, ge=1.0, le=3600.0, description="seconds between checkpoints")
+
+    def steps_key(self, function: Function) -> str:
+        """Which field says how many steps the network of a function is trained for."""
+        if function is Function.VISIBILITY:
+            return "visibility_steps"
+        return "steps" if self.solver is Solver.CNN else "start_steps"
 
 
 class PackageSettings(Contract):
@@ -108,7 +115,7 @@ PRESETS: Final[Mapping[str, BakeSettings]] = {
         preset="draft",
         lightmap=LightmapSettings(resolution=32, tile=8),
         render=RenderSettings(image_size=32, samples=32, irradiance_samples=512),
-        fit=FitSettings(lobes=8, steps=1000, visibility_steps=500),
+        fit=FitSettings(lobes=8, steps=1000, start_steps=500, visibility_steps=500),
         package=PackageSettings(environment_size=64),
     ),
     "preview": BakeSettings(
@@ -121,7 +128,7 @@ PRESETS: Final[Mapping[str, BakeSettings]] = {
         preset="production",
         lightmap=LightmapSettings(resolution=512),
         render=RenderSettings(image_size=128, samples=128, irradiance_samples=4096, max_depth=8),
-        fit=FitSettings(lobes=16, steps=60_000, visibility_steps=24_000),
+        fit=FitSettings(lobes=16, steps=60_000, start_steps=20_000, visibility_steps=24_000),
         package=PackageSettings(environment_size=256),
     ),
 }

@@ -12,7 +12,7 @@ from kiln_workers.fit.field import TexelField, TracedBetween
 from kiln_workers.fit.lobes import constrain
 from kiln_workers.fit.loss import reference_loss
 from kiln_workers.fit.metrics import horizon_weights
-from kiln_workers.fit.network import pixel_centres
+from kiln_workers.fit.network import pixel_centres, solid_angles
 from kiln_workers.fit.solution import Lobes, mixed_lobes
 from kiln_workers.fit.solvers import joint as module
 from kiln_workers.fit.solvers.alignment import Neighbourhood
@@ -60,7 +60,7 @@ def start_of(field: TexelField) -> torch.Tensor:
 
 
 def slow_loss(field: TexelField, lobes: torch.Tensor) -> torch.Tensor:
-    """Both sums of the module's docstring, pixel by pixel, from the formulas."""
+    """The sums of the module's docstring, pixel by pixel, from the formulas; a floor's mirror image turns rows over."""
     directions = pixel_centres(SIZE)
 
     def log_targets(images: np.ndarray) -> torch.Tensor:
@@ -68,6 +68,10 @@ def slow_loss(field: TexelField, lobes: torch.Tensor) -> torch.Tensor:
 
     weights = horizon_weights(torch.from_numpy(field.normals), SIZE)
     total = reference_loss(lobes, log_targets(field.images), directions, weights)
+    height = directions[:, 1]
+    below = ((height <= 0.0) & (height > -0.5)).expand(len(field), -1)
+    continued = 0.1 * torch.where(below, solid_angles(SIZE), 0.0)
+    total = total + reference_loss(lobes, log_targets(field.images[:, ::-1].copy()), directions, continued)
     assert field.traced is not None
     mixed = mixed_lobes(lobes, torch.from_numpy(field.between.corners), torch.full((len(field.between), 4), 0.25))
     for point in range(len(field.traced)):

@@ -92,7 +92,7 @@ def test_the_scale_of_the_scene_does_not_matter(lobe_source: ArraySource) -> Non
 def test_a_fit_that_collapses_fails_with_its_numbers(lobe_source: ArraySource) -> None:
     with pytest.raises(FitFailed, match=r"ended at log_mse .* of the .* no light at all") as caught:
         train(lobe_source, FitSettings(lobes=4, steps=40, batch=10, learning_rate=1.0), LIGHT, 0)
-    assert "fit.steps (now 40)" in (caught.value.remedy or "") and caught.value.where == "fit light_field"
+    assert "fit.start_steps (now 40)" in (caught.value.remedy or "") and caught.value.where == "fit light_field"
 
 
 def test_darkness_is_no_failure(lobe_source: ArraySource) -> None:

@@ -50,3 +50,10 @@ def test_jacobian_matches_finite_differences() -> None:
     dx = (octahedral.decode(xy + along_x) - octahedral.decode(xy - along_x)) / (2.0 * step)
     dy = (octahedral.decode(xy + along_y) - octahedral.decode(xy - along_y)) / (2.0 * step)
     np.testing.assert_allclose(np.linalg.norm(np.cross(dx, dy), axis=-1), octahedral.jacobian(xy), rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [16, 64])
+def test_pixels_of_directions_are_those_whose_square_they_lie_in(size: int) -> None:
+    inside = np.random.default_rng(3).uniform(0.01, 0.99, 2)
+    directions = octahedral.decode(octahedral.pixel_grid(size, (inside[0], inside[1])))
+    np.testing.assert_array_equal(octahedral.pixel_of(directions, size).ravel(), np.arange(size * size))

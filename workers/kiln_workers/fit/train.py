@@ -231,13 +231,13 @@ def _metrics(errors: TexelErrors, *, signal: bool) -> FitMetrics:
 
 
 def _refuse_failure(errors: TexelErrors, function: Function, settings: FitSettings) -> None:
-    key = "fit.steps" if function is Function.LIGHT_FIELD else "fit.visibility_steps"
     if not errors.log_mse_rel <= FAILURE_RATIO:  # also true for NaN
         raise FitFailed(
             f"the fit of the {function.value} ended at log_mse {errors.log_mse:.4g}, {errors.log_mse_rel:.0%} of the "
             f"{errors.log_mse_zero:.4g} that no light at all would have (at most {FAILURE_RATIO:.0%} is accepted)",
             where=f"fit {function.value}",
-            remedy=f"Raise {key} (now {settings.steps}) or fit.lobes (now {settings.lobes}).",
+            remedy=f"Raise fit.{settings.steps_key(function)} (now {settings.steps}) "
+            f"or fit.lobes (now {settings.lobes}).",
         )
 
 

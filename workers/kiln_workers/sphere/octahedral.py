@@ -51,6 +51,12 @@ def pixel_directions(size: int) -> Floats:
     return decode(pixel_grid(size))
 
 
+def pixel_of(directions: Floats, size: int) -> npt.NDArray[np.int64]:
+    """Row-major number [...] of the pixel of an image of `size` that each direction [..., 3] lies in."""
+    column, row = np.moveaxis(np.clip((0.5 * size * (encode(directions) + 1.0)).astype(np.int64), 0, size - 1), -1, 0)
+    return np.asarray(row * size + column)
+
+
 @lru_cache(maxsize=8)
 def pixel_solid_angles(size: int) -> Floats:
     """Exact solid angles [R, R] of the pixels in steradians (R even); they sum to 4 pi. Read-only: shared.

@@ -1,6 +1,5 @@
 """Fit one function: stream the rendered tiles through the network until it is trained."""
 
-from kiln_schemas.settings import Function
 from kiln_schemas.tasks import FitPayload, FitResult, Progress
 from kiln_workers.fit.source import StoreSource
 from kiln_workers.fit.train import train
@@ -23,9 +22,8 @@ def run(payload: FitPayload, context: Context) -> FitResult:
     def on_progress(at: Progress) -> None:
         context.progress(at.done, at.total, at.unit, at.message, at.loss)
 
-    settings = payload.settings.fit
-    if payload.function is Function.VISIBILITY:
-        settings = settings.model_copy(update={"steps": settings.visibility_steps})
+    asked = payload.settings.fit
+    settings = asked.model_copy(update={"steps": getattr(asked, asked.steps_key(payload.function))})
     outcome = train(
         source,
         settings,

@@ -12,6 +12,10 @@ neighbours. It is strong at first, so that lobes move through the light field to
 decays to almost nothing, so that it does not blur what they end as. Each step looks at a random subset of the pixels
 above each horizon, one of `stride` in a row, which costs an eighth of all and serves as well.
 
+Below a texel's horizon there is no light to fit, but a rough surface seen from the side is shaded with a kernel that
+reaches there, and lobes that nothing holds draw speckles. So just below it the light field is continued as its own
+mirror image in the tangent plane, with a small weight.
+
 The start is the network's output, which is coherent over the whole light map; so blocks that are solved apart from each
 other, with a margin of their neighbours' texels that is dropped afterwards, agree where they meet.
 docs/design/fit.md has the measurements behind every number here.
@@ -30,17 +34,18 @@ from kiln_schemas.settings import FitSettings
 from kiln_workers.fit.field import TexelField, TracedBetween
 from kiln_workers.fit.lobes import constrain
 from kiln_workers.fit.metrics import horizon_weights
-from kiln_workers.fit.network import pixel_centres
+from kiln_workers.fit.network import pixel_centres, solid_angles
 from kiln_workers.fit.optimizer import Moments, one_cycle
 from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, mixed_lobes, nobody
 from kiln_workers.fit.solvers.alignment import Neighbourhood
 from kiln_workers.fit.solvers.encoder import SETTINGS, cnn
 from kiln_workers.fit.solvers.losses import texel_losses
-from kiln_workers.fit.solvers.pixels import Pixels, above_horizon, gather, split
+from kiln_workers.fit.solvers.pixels import Pixels, split, with_weight
 from kiln_workers.fit.solvers.starts import unconstrain
 from kiln_workers.fit.solvers.stopwatch import Stopwatch
 from kiln_workers.fit.source import Index
 from kiln_workers.fit.threads import single_threaded_pool
+from kiln_workers.sphere import octahedral
 
 RATE: Final = 0.1
 ALIGNMENT: Final = (0.3, 0.01)
@@ -49,6 +54,10 @@ TEXEL_PIXELS: Final = 512
 """Pixels of a texel that one step looks at, at least."""
 BETWEEN_PIXELS: Final = 128
 """Pixels of a between point that one step looks at, at least."""
+CONTINUATION: Final = 0.1
+"""Weight of the pixels below a texel's horizon, where its light field is continued as its mirror image."""
+CONTINUATION_DEPTH: Final = 0.5
+"""Sine of how far below the horizon that goes."""
 EPSILON: Final = 1e-10
 
 _STREAM: Final = 0x636F68
@@ -71,8 +80,9 @@ def coherent(
     settings: FitSettings = SETTINGS,
     seed: int = 0,
 ) -> Solution:
-    """The network trained on the field, then `settings.refine_steps` of the descent; epochs and seconds of both."""
-    trained = cnn(field, lobes, on_epoch, settings=settings, seed=seed)
+    """The network after `settings.start_steps`, then `refine_steps` of the descent; epochs and seconds of both."""
+    start_settings = settings.model_copy(update={"steps": settings.start_steps})
+    trained = cnn(field, lobes, on_epoch, settings=start_settings, seed=seed)
     watch = Stopwatch(on_epoch)
     normals = torch.from_numpy(field.normals)
 
@@ -126,7 +136,7 @@ class _Problem:
     def __init__(self, field: TexelField, pool: ThreadPoolExecutor) -> None:
         self._pool = pool
         texels = split(len(field), _TEXELS)
-        self._texels = list(zip(texels, pool.map(lambda part: gather(field, part), texels), strict=True))
+        self._texels = list(zip(texels, pool.map(lambda part: _gather_continued(field, part), texels), strict=True))
         targets = field.traced if field.traced is not None else mean_targets(field)
         self._corners = torch.from_numpy(field.between.corners[targets.points])
         points = split(len(targets), _POINTS)
@@ -192,6 +202,25 @@ def mean_targets(field: TexelField) -> TracedBetween:
     return TracedBetween(np.arange(len(between)), normals.astype(np.float32), offsets, images)
 
 
+def _gather_continued(field: TexelField, part: Index) -> Pixels:
+    """The pixels of some texels above their horizon, and those just below it with the light field's mirror image."""
+    size, images = field.image_size, field.images[part]
+    normals = torch.from_numpy(field.normals[part])
+    weights = horizon_weights(normals, size)  # [T, R * R]
+    centres = pixel_centres(size)
+    height = normals @ centres.T
+    below = (height <= 0.0) & (height > -CONTINUATION_DEPTH)
+    texel, pixel = below.nonzero(as_tuple=True)
+    mirrored = centres[pixel] - 2.0 * height[texel, pixel, None] * normals[texel]
+    source = octahedral.pixel_of(mirrored.numpy(), size)
+    seen = weights[texel, torch.from_numpy(source)] > 0.0
+    weights[texel, pixel] = CONTINUATION * seen * solid_angles(size)[pixel]
+    flat = images.reshape(len(images), -1, 3).copy()
+    flat[texel.numpy(), pixel.numpy()] = flat[texel.numpy(), source]
+    every = torch.arange(size * size).expand(len(part), -1)
+    return with_weight(size, every, weights, flat.reshape(images.shape), field.exposure, normals)
+
+
 def _gather_between(field: TexelField, targets: TracedBetween, part: Index) -> Pixels:
     """The pixels of some between points that were traced and whose centre is above the horizon there."""
     size, half = field.image_size, field.image_size // 2
@@ -200,4 +229,4 @@ def _gather_between(field: TexelField, targets: TracedBetween, part: Index) -> P
     columns = 2 * np.arange(half)[None, None, :] + targets.offsets[part, 1][:, None, None]
     pixel = torch.from_numpy((rows * size + columns).reshape(len(part), -1))  # [B, K] of the whole image
     weights = 4.0 * horizon_weights(normals, size).gather(1, pixel)
-    return above_horizon(size, pixel, weights, targets.images[part], field.exposure, normals)
+    return with_weight(size, pixel, weights, targets.images[part], field.exposure, normals)

@@ -78,12 +78,10 @@ def gather(field: TexelField, chosen: Index) -> Pixels:
     normals = torch.from_numpy(field.normals[chosen])
     weights = horizon_weights(normals, size)  # [T, R * R]
     pixel = torch.arange(size * size).expand(len(chosen), -1)
-    return above_horizon(size, pixel, weights, field.images[chosen], field.exposure, normals)
+    return with_weight(size, pixel, weights, field.images[chosen], field.exposure, normals)
 
 
-def above_horizon(
-    size: int, pixel: Tensor, weights: Tensor, images: Float16, exposure: float, normals: Tensor
-) -> Pixels:
+def with_weight(size: int, pixel: Tensor, weights: Tensor, images: Float16, exposure: float, normals: Tensor) -> Pixels:
     """Of pixels [T, K] of images of `size` those whose weight [T, K] is not 0, in order.
 
     `images` [T, r, r, 3] in scene units hold these K = r * r pixels.
