@@ -1,7 +1,9 @@
 """What clients send to the coordinator and what it tells them."""
 
+import re
+from collections.abc import Sequence
 from datetime import datetime
-from typing import Any
+from typing import Annotated, Any, Final
 
 from pydantic import Field
 
@@ -11,6 +13,15 @@ from kiln_schemas.gates import Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Bundle, Progress, Sha256, TaskKind
+
+DEFAULT_PRIORITY: Final = 50
+
+Priority = Annotated[int, Field(ge=0, le=100, description="of two jobs that wait the greater goes first")]
+LABEL_KEY: Final = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,62}$"
+LABEL_LENGTH: Final = 128
+LabelKey = Annotated[str, Field(pattern=LABEL_KEY)]
+LabelValue = Annotated[str, Field(max_length=LABEL_LENGTH)]
+Labels = Annotated[dict[LabelKey, LabelValue], Field(max_length=32)]
 
 
 class JobRequest(Contract):
@@ -24,6 +35,17 @@ class JobRequest(Contract):
     gates: Gates = Gates()
     cameras: Cameras = Field(default_factory=dict)
     """By name; those that a FLIP gate names are shaded and path-traced."""
+    priority: Priority = DEFAULT_PRIORITY
+    labels: Labels = Field(default_factory=dict)
+    """Free words to find the job by: project, shot, commit, ..."""
+
+
+class JobChange(Contract):
+    """Body of `PATCH /v1/jobs/{id}`: what is left out stays."""
+
+    priority: Priority | None = None
+    labels: Labels | None = None
+    """All labels from now on."""
 
 
 class StageView(Contract):
@@ -58,6 +80,12 @@ class JobView(Contract):
     cameras: Cameras = Field(default_factory=dict)
     gate_results: tuple[GateResult, ...] = ()
     """Empty until the package has been measured."""
+    priority: int = DEFAULT_PRIORITY
+    labels: dict[str, str] = Field(default_factory=dict)
+    submitter: str | None = None
+    """Name of the token it was submitted with."""
+    renders_of: str | None = None
+    """The job whose light fields it uses, where they are the same; nothing was rendered again then."""
 
 
 class JobPage(Contract):
@@ -102,6 +130,21 @@ class MissingRequest(Contract):
 
 class MissingReply(Contract):
     missing: tuple[Sha256, ...]
+
+
+def read_labels(words: Sequence[str], where: str = "--label") -> dict[str, str]:
+    """Labels of `KEY=VALUE` words; InputError where one is none."""
+    labels: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not re.fullmatch(LABEL_KEY, key) or len(value) > LABEL_LENGTH:
+            raise InputError(
+                f"'{word}' is not a label",
+                where=where,
+                remedy=f"Write KEY=VALUE: the key of letters, digits and . _ / -, the value of {LABEL_LENGTH} at most.",
+            )
+        labels[key] = value
+    return labels
 
 
 def check_bundle_path(path: str) -> str:

@@ -1,8 +1,8 @@
 """States of jobs and tasks and the only moves between them.
 
-Tasks: waiting > queued > active > completed | failed | canceled; a lost or failed attempt moves
-active > queued (retry). Jobs: queued > active > completed | gate-failed | failed, or
-cancel-requested > canceled.
+Tasks: waiting > queued > active > completed | failed | canceled; a lost or failed attempt moves active > queued.
+Jobs: queued > active > completed | gate-failed | failed, or cancel-requested > canceled; paused and back; whatever
+is over may be archived. A retried job is queued again, and its failed and canceled tasks wait or queue again.
 """
 
 from collections.abc import Mapping
@@ -19,16 +19,20 @@ class JobState(StrEnum):
     """Accepted; none of its tasks has been claimed."""
     ACTIVE = "active"
     """At least one task has been claimed."""
+    PAUSED = "paused"
+    """Running tasks go on to their end; nothing more is given to workers until it is resumed."""
     CANCEL_REQUESTED = "cancel-requested"
     """A person or program asked to stop; running tasks have not all stopped yet."""
     CANCELED = "canceled"
-    """Stopped on request; no task runs. Final."""
+    """Stopped on request; no task runs. Over, unless it is retried."""
     FAILED = "failed"
-    """A task failed for good; its error is the job's. Final."""
+    """A task failed for good; its error is the job's. Over, unless it is retried."""
     COMPLETED = "completed"
-    """All artifacts are published, and every quality gate is met. Final."""
+    """All artifacts are published, and every quality gate is met. Over."""
     GATE_FAILED = "gate-failed"
-    """All artifacts are published, but the package misses a quality gate; the error says which. Final."""
+    """All artifacts are published, but the package misses a quality gate; the error says which. Over."""
+    ARCHIVED = "archived"
+    """Over and put aside: lists leave it out unless asked for. Its error, events and artifacts stay."""
 
 
 class TaskState(StrEnum):
@@ -41,36 +45,47 @@ class TaskState(StrEnum):
     ACTIVE = "active"
     """Claimed by one worker under the current attempt."""
     FAILED = "failed"
-    """Out of attempts, or failed in a way that no retry mends. Final."""
+    """Out of attempts, or failed in a way that no other attempt mends. Over, unless its job is retried."""
     CANCELED = "canceled"
-    """Stopped with its job. Final."""
+    """Stopped with its job. Over, unless that is retried."""
     COMPLETED = "completed"
-    """Committed under its current attempt. Final."""
+    """Committed under its current attempt, or its result is that of an earlier job. Over."""
 
 
 JOB_TRANSITIONS: Final[Mapping[JobState, frozenset[JobState]]] = {
-    JobState.QUEUED: frozenset({JobState.ACTIVE, JobState.CANCEL_REQUESTED, JobState.FAILED}),
-    JobState.ACTIVE: frozenset({JobState.COMPLETED, JobState.GATE_FAILED, JobState.FAILED, JobState.CANCEL_REQUESTED}),
+    JobState.QUEUED: frozenset({JobState.ACTIVE, JobState.PAUSED, JobState.CANCEL_REQUESTED, JobState.FAILED}),
+    JobState.ACTIVE: frozenset(
+        {JobState.PAUSED, JobState.COMPLETED, JobState.GATE_FAILED, JobState.FAILED, JobState.CANCEL_REQUESTED}
+    ),
+    JobState.PAUSED: frozenset(
+        {
+            *(JobState.QUEUED, JobState.ACTIVE, JobState.COMPLETED, JobState.GATE_FAILED, JobState.FAILED),
+            JobState.CANCEL_REQUESTED,
+        }
+    ),
     JobState.CANCEL_REQUESTED: frozenset({JobState.CANCELED}),
-    JobState.CANCELED: frozenset(),
-    JobState.FAILED: frozenset(),
-    JobState.COMPLETED: frozenset(),
-    JobState.GATE_FAILED: frozenset(),
+    JobState.CANCELED: frozenset({JobState.QUEUED, JobState.ARCHIVED}),
+    JobState.FAILED: frozenset({JobState.QUEUED, JobState.ARCHIVED}),
+    JobState.COMPLETED: frozenset({JobState.ARCHIVED}),
+    JobState.GATE_FAILED: frozenset({JobState.ARCHIVED}),
+    JobState.ARCHIVED: frozenset(),
 }
 
 TASK_TRANSITIONS: Final[Mapping[TaskState, frozenset[TaskState]]] = {
-    TaskState.WAITING: frozenset({TaskState.QUEUED, TaskState.CANCELED}),
+    TaskState.WAITING: frozenset({TaskState.QUEUED, TaskState.COMPLETED, TaskState.CANCELED}),
     TaskState.QUEUED: frozenset({TaskState.ACTIVE, TaskState.CANCELED}),
     TaskState.ACTIVE: frozenset({TaskState.QUEUED, TaskState.COMPLETED, TaskState.FAILED, TaskState.CANCELED}),
-    TaskState.FAILED: frozenset(),
-    TaskState.CANCELED: frozenset(),
+    TaskState.FAILED: frozenset({TaskState.QUEUED}),
+    TaskState.CANCELED: frozenset({TaskState.WAITING, TaskState.QUEUED}),
     TaskState.COMPLETED: frozenset(),
 }
 
-FINAL_JOB_STATES: Final = frozenset(s for s, moves in JOB_TRANSITIONS.items() if not moves)
+LIVE_JOB_STATES: Final = frozenset({JobState.QUEUED, JobState.ACTIVE, JobState.PAUSED})
+"""Those in which what a worker has of the job is wanted."""
+FINAL_JOB_STATES: Final = frozenset(JobState) - LIVE_JOB_STATES - {JobState.CANCEL_REQUESTED}
+"""Those of a job that is over: nothing happens to it any more unless somebody asks."""
 PUBLISHED_JOB_STATES: Final = frozenset({JobState.COMPLETED, JobState.GATE_FAILED})
-"""Those in which a job has artifacts."""
-FINAL_TASK_STATES: Final = frozenset(s for s, moves in TASK_TRANSITIONS.items() if not moves)
+"""Those in which a job has artifacts; an archived one may have some."""
 
 
 def check_job_move(before: JobState, after: JobState) -> None:

@@ -1,17 +1,23 @@
-"""What clients ask of a job: submit it, cancel it."""
+"""What clients ask of a job: submit, rank and label, pause and resume, cancel, retry, archive it."""
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Sequence, Set
+
+from psycopg.types.json import Jsonb
 
 from kiln_schemas.errors import Conflict, InputError, NotFound
 from kiln_schemas.gates import check_gates
-from kiln_schemas.job import JobRequest, check_bundle
+from kiln_schemas.job import JobChange, JobRequest, check_bundle
 from kiln_schemas.settings import BakeSettings, make_settings
 from kiln_schemas.states import FINAL_JOB_STATES, JobState
+from kiln_schemas.tasks import TaskKind
 from kiln_service import queue, transitions
+from kiln_service.auth import Principal
 from kiln_service.blobs import require_blobs, use_blobs
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, JobRow, Tx
-from kiln_service.planner import SG_LIGHTFIELD, plan_job
+from kiln_service.events import add_event
+from kiln_service.planner import METHODS, SG_LIGHTFIELD, plan_job
 
 
 def settings_of(request: JobRequest) -> BakeSettings:
@@ -27,12 +33,20 @@ def settings_of(request: JobRequest) -> BakeSettings:
     return request.settings
 
 
-async def submit(database: Database, config: ServiceConfig, request: JobRequest, actor: str) -> JobRow:
-    """Accept a job: its settings and gates are valid, its bundle is closed and its files are here."""
+async def submit(
+    database: Database, config: ServiceConfig, request: JobRequest, who: Principal, key: str | None = None
+) -> JobRow:
+    """Accept a job: its settings and gates are valid, its bundle is closed and its files are here.
+
+    The same request under the same `Idempotency-Key` `key` makes no second job; another one is refused.
+    """
+    submission = transitions.Submission(who.name, key, hashlib.sha256(request.model_dump_json().encode()).hexdigest())
     settings = settings_of(request)
     bundle = check_bundle(request.bundle)
     gates = check_gates(request.gates, request.cameras)
     async with database.transaction() as tx:
+        if (earlier := await _submitted(tx, submission)) is not None:
+            return earlier
         if absent := await require_blobs(tx, bundle.files.values()):
             names = sorted(f"{path} ({sha256})" for path, sha256 in bundle.files.items() if sha256 in absent)
             raise Conflict(
@@ -50,10 +64,95 @@ async def submit(database: Database, config: ServiceConfig, request: JobRequest,
             cameras=request.cameras,
             store_base=config.store_base,
             planned=plan_job(),
-            actor=actor,
+            actor=who.actor,
+            priority=request.priority,
+            labels=request.labels,
+            submission=submission,
         )
         await use_blobs(tx, f"job:{job.id}", bundle.files.values())
     return job
+
+
+async def _submitted(tx: Tx, submission: transitions.Submission) -> JobRow | None:
+    """The job that a submission with this key has made before; InputError where that asked for something else."""
+    if submission.key is None:
+        return None
+    await tx.run("lock_idempotency_key", key=f"{submission.submitter}:{submission.key}")
+    row = await tx.maybe("find_submission", submitter=submission.submitter, key=submission.key)
+    if row is None:
+        return None
+    if row["request_sha256"] != submission.sha256:
+        raise InputError(
+            f"the key '{submission.key}' was sent with another request, which is job {row['id']}",
+            where="Idempotency-Key",
+            remedy="Send a key of its own with each request, and the same only with a repetition.",
+        )
+    return JobRow.of(row)
+
+
+async def change(database: Database, job_id: str, wanted: JobChange, actor: str) -> None:
+    """Rank or label a job anew; its waiting tasks change their place in the queue."""
+    async with database.transaction() as tx:
+        await lock_job(tx, job_id)
+        labels = None if wanted.labels is None else Jsonb(dict(wanted.labels))
+        await tx.run("change_job", id=job_id, priority=wanted.priority, labels=labels)
+        await add_event(tx, job_id, "job.changed", actor, detail=wanted.model_dump(mode="json", exclude_none=True))
+    if wanted.priority is not None:
+        async with database.transaction() as tx:  # a claim locks the queue before the job (see `Tx` on locks)
+            await tx.run("rank_queue_jobs", job_id=job_id, priority=wanted.priority, step=queue.PRIORITY_STEP)
+
+
+async def pause(database: Database, job_id: str, actor: str) -> None:
+    """Give no more of a job's tasks to workers; those that run go on. Asking twice is no error."""
+    async with database.transaction() as tx:
+        job = await lock_job(tx, job_id)
+        if job.state is JobState.PAUSED:
+            return
+        _require(job, {JobState.QUEUED, JobState.ACTIVE}, "paused")
+        idle = await transitions.pause_job(tx, job, actor)
+    await withdraw(database, idle)
+
+
+async def resume(database: Database, job_id: str, actor: str) -> None:
+    """Go on with a paused job. Asking twice is no error."""
+    async with database.transaction() as tx:
+        job = await lock_job(tx, job_id)
+        if job.state in (JobState.QUEUED, JobState.ACTIVE):
+            return
+        _require(job, {JobState.PAUSED}, "resumed")
+        await transitions.resume_job(tx, job, actor)
+
+
+async def retry(database: Database, job_id: str, actor: str) -> None:
+    """Do a failed or canceled job's unfinished tasks again; what has completed stays."""
+    async with database.transaction() as tx:
+        job = await lock_job(tx, job_id)
+        _require(job, {JobState.FAILED, JobState.CANCELED}, "retried")
+        kinds = {TaskKind(row["kind"]) for row in await tx.all("first_unfinished", job_id=job.id)}
+        stage = next((stage for stage in METHODS[job.method].stages if stage in kinds), None)
+        if stage is None:
+            raise Conflict(
+                f"job {job_id} has no unfinished task: {job.error.sentence() if job.error else job.state}",
+                where="job",
+                remedy="Mend the input and submit it again.",
+            )
+        await transitions.reopen_job(tx, job, stage, actor)
+
+
+async def archive(database: Database, job_id: str, actor: str) -> None:
+    """Put a job that is over aside: lists leave it out unless asked for. Asking twice is no error."""
+    async with database.transaction() as tx:
+        job = await lock_job(tx, job_id)
+        if job.state is JobState.ARCHIVED:
+            return
+        _require(job, FINAL_JOB_STATES, "archived")
+        await transitions.move_job(tx, job, JobState.ARCHIVED, actor)
+
+
+def _require(job: JobRow, states: Set[JobState], what: str) -> None:
+    if job.state not in states:
+        wanted = " or ".join(sorted(states))
+        raise Conflict(f"job {job.id} is {job.state} and cannot be {what}; it would have to be {wanted}", where="job")
 
 
 async def cancel(database: Database, job_id: str, actor: str) -> None:

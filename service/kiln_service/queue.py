@@ -19,11 +19,14 @@ from procrastinate.jobs import Job, Status
 from procrastinate.manager import JobManager
 
 from kiln_schemas.errors import InternalError
+from kiln_schemas.states import JobState
 from kiln_schemas.tasks import TaskKind
-from kiln_service.db import Tx
+from kiln_service.db import JobRow, Tx
 from kiln_service.planner import PRIORITY
 
 TASK_NAME: Final = "kiln.task"
+PRIORITY_STEP: Final = 8
+"""A job's priority counts before its tasks' kinds, of which there are fewer."""
 
 
 class _OneConnection:
@@ -53,16 +56,19 @@ async def beat(tx: Tx, queue_worker: int) -> None:
     await (await _manager(tx)).update_heartbeat(queue_worker)
 
 
-async def defer(tx: Tx, tasks: Sequence[tuple[str, TaskKind]]) -> None:
-    """Enqueue tasks (id, kind) and remember their queue jobs; a task is never waiting in the queue twice."""
-    if not tasks:
+async def defer(tx: Tx, job: JobRow, tasks: Sequence[tuple[str, TaskKind]]) -> None:
+    """Enqueue tasks (id, kind) of a job and remember their queue jobs; a task is never waiting in the queue twice.
+
+    Those of a paused job stay out of the queue until it is resumed.
+    """
+    if not tasks or job.state is JobState.PAUSED:
         return
     manager = await _manager(tx)
     jobs = await manager.batch_defer_jobs_async(
         [
             Job(
                 queue=kind.value,
-                priority=PRIORITY[kind],
+                priority=job.priority * PRIORITY_STEP + PRIORITY[kind],
                 lock=None,
                 queueing_lock=task_id,
                 task_name=TASK_NAME,
@@ -85,13 +91,15 @@ async def fetch(tx: Tx, kinds: Sequence[TaskKind], queue_worker: int) -> tuple[i
     return job.id, str(job.task_kwargs["task_id"])
 
 
-async def retry(tx: Tx, queue_job: int | None, task: tuple[str, TaskKind]) -> None:
-    """Put a running queue job back; defer a new one where it is gone."""
-    if await _status(tx, queue_job) is Status.DOING and queue_job is not None:
+async def retry(tx: Tx, job: JobRow, queue_job: int | None, task: tuple[str, TaskKind]) -> None:
+    """Put a running queue job back; defer a new one where it is gone. A paused job's is deleted."""
+    if job.state is JobState.PAUSED:
+        await finish(tx, queue_job)
+    elif await _status(tx, queue_job) is Status.DOING and queue_job is not None:
         await (await _manager(tx)).retry_job_by_id_async(queue_job, retry_at=datetime.now(UTC))
         await tx.run("notify_queued", kinds=task[1].value)
     else:
-        await defer(tx, [task])
+        await defer(tx, job, [task])
 
 
 async def finish(tx: Tx, queue_job: int | None) -> None:

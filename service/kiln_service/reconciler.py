@@ -7,7 +7,7 @@ queue job that waits for a task which is not queued is deleted.
 
 import logging
 
-from kiln_schemas.states import TaskState
+from kiln_schemas.states import JobState, TaskState
 from kiln_service import queue
 from kiln_service.db import Database
 from kiln_service.work import lock_task
@@ -24,10 +24,10 @@ async def reconcile(database: Database) -> int:
     repaired = len(strays)
     for row in orphans:
         async with database.transaction() as tx:
-            _, task = await lock_task(tx, row["id"])
+            job, task = await lock_task(tx, row["id"])
             present = (await tx.one("has_queue_job", queue_job=task.queue_job))["present"]
-            if task.state is TaskState.QUEUED and not present:
+            if task.state is TaskState.QUEUED and job.state is not JobState.PAUSED and not present:
                 log.warning("%s %s was queued without a queue job; deferred again", task.kind, task.label)
-                await queue.defer(tx, [(task.id, task.kind)])
+                await queue.defer(tx, job, [(task.id, task.kind)])
                 repaired += 1
     return repaired

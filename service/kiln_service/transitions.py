@@ -5,7 +5,7 @@ caller has locked the job and, for a move of a task, the task (`Tx`'s order of l
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from psycopg.types.json import Jsonb
@@ -15,7 +15,7 @@ from kiln_schemas.errors import IllegalTransition, Problem
 from kiln_schemas.gates import GateResult, Gates, gate_problem
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState, check_job_move, check_task_move
-from kiln_schemas.tasks import Bundle, Result
+from kiln_schemas.tasks import Bundle, Result, TaskKind
 from kiln_service import queue
 from kiln_service.blobs import drop_blobs
 from kiln_service.db import JobRow, TaskRow, Tx, WorkerRow
@@ -25,6 +25,15 @@ from kiln_service.planner import Planned
 
 COORDINATOR: Final = "coordinator"
 """The actor of what nobody asked for."""
+
+
+@dataclass(frozen=True)
+class Submission:
+    """Who sent a request, under which `Idempotency-Key`, and the hash of what it said."""
+
+    submitter: str
+    key: str | None
+    sha256: str
 
 
 async def create_job(
@@ -39,6 +48,9 @@ async def create_job(
     store_base: str,
     planned: Sequence[Planned],
     actor: str,
+    priority: int,
+    labels: Mapping[str, str],
+    submission: Submission,
 ) -> JobRow:
     """A new job, queued, with its first tasks."""
     job_id = new_id()
@@ -52,6 +64,11 @@ async def create_job(
         gates=Jsonb(gates.model_dump(mode="json")),
         cameras=Jsonb({name: camera.model_dump(mode="json") for name, camera in cameras.items()}),
         store_url=f"{store_base}/{job_id}.zarr",
+        priority=priority,
+        labels=Jsonb(dict(labels)),
+        submitter=submission.submitter,
+        idempotency_key=submission.key,
+        request_sha256=submission.sha256,
     )
     job = JobRow.of(row)
     await add_event(tx, job.id, "job.created", actor, detail={"name": name})
@@ -73,20 +90,21 @@ async def add_tasks(tx: Tx, job: JobRow, planned: Sequence[Planned]) -> None:
         for place, task in enumerate(planned)
     ]
     await tx.run("insert_tasks", job_id=job.id, tasks=Jsonb(rows))
-    await queue.defer(tx, [(str(row["id"]), task.kind) for row, task in zip(rows, planned, strict=True) if task.ready])
+    ready = [(str(row["id"]), task.kind) for row, task in zip(rows, planned, strict=True) if task.ready]
+    await queue.defer(tx, job, ready)
     counts: dict[str, int] = {}
     for task in planned:
         counts[task.kind.value] = counts.get(task.kind.value, 0) + 1
     await add_event(tx, job.id, "tasks.planned", COORDINATOR, detail=counts)
 
 
-async def release_task(tx: Tx, task: TaskRow) -> None:
+async def release_task(tx: Tx, job: JobRow, task: TaskRow) -> None:
     """waiting > queued."""
     if task.state is not TaskState.WAITING:
         raise IllegalTransition(f"a task that is {task.state} cannot be released")
     check_task_move(task.state, TaskState.QUEUED)
     await _move(tx, "move_task_queued", task)
-    await queue.defer(tx, [(task.id, task.kind)])
+    await queue.defer(tx, job, [(task.id, task.kind)])
     await _task_event(tx, task, "task.queued", COORDINATOR)
 
 
@@ -100,13 +118,13 @@ async def claim_task(tx: Tx, job: JobRow, task: TaskRow, worker: WorkerRow) -> T
     return claimed
 
 
-async def requeue_task(tx: Tx, task: TaskRow, kind: str, actor: str, *, strike: bool, reason: str) -> None:
+async def requeue_task(tx: Tx, job: JobRow, task: TaskRow, kind: str, actor: str, *, strike: bool, reason: str) -> None:
     """active > queued: another attempt may try; `kind` is the event (`task.retried`, `task.lost`)."""
     if task.state is not TaskState.ACTIVE:
         raise IllegalTransition(f"a task that is {task.state} cannot be retried")
     check_task_move(task.state, TaskState.QUEUED)
     await _move(tx, "move_task_requeued", task, strikes=int(strike))
-    await queue.retry(tx, task.queue_job, (task.id, task.kind))
+    await queue.retry(tx, job, task.queue_job, (task.id, task.kind))
     await _task_event(tx, task, kind, actor, {"reason": reason, "strikes": task.strikes + int(strike)})
 
 
@@ -147,6 +165,51 @@ async def cancel_idle_tasks(tx: Tx, job: JobRow, actor: str) -> list[int]:
     if rows:
         await add_event(tx, job.id, "tasks.canceled", actor, detail={"count": len(rows)})
     return [row["queue_job"] for row in rows if row["queue_job"] is not None]
+
+
+async def reuse_renders(tx: Tx, job: JobRow, source: str, store_url: str) -> int:
+    """waiting > completed, all render tasks of a job whose light fields `source` has; how many."""
+    check_task_move(TaskState.WAITING, TaskState.COMPLETED)
+    await tx.run("share_renders", id=job.id, source=source, store_url=store_url)
+    rows = await tx.all(
+        "reuse_results", job_id=job.id, source=source, kind=TaskKind.RENDER, before=TaskState.WAITING.value
+    )
+    await add_event(tx, job.id, "tasks.reused", COORDINATOR, detail={"count": len(rows), "job": source})
+    return len(rows)
+
+
+async def pause_job(tx: Tx, job: JobRow, actor: str) -> list[int]:
+    """queued, active > paused; returns the queue jobs to withdraw in a later transaction."""
+    await move_job(tx, job, JobState.PAUSED, actor)
+    return [row["queue_job"] for row in await tx.all("queued_queue_jobs", job_id=job.id)]
+
+
+async def resume_job(tx: Tx, job: JobRow, actor: str) -> JobRow:
+    """paused > queued, or > active where it has begun; its tasks are in the queue again."""
+    if job.state is not JobState.PAUSED:
+        raise IllegalTransition(f"a job that is {job.state} cannot be resumed")
+    job = await move_job(tx, job, JobState.ACTIVE if job.started else JobState.QUEUED, actor)
+    await enqueue(tx, job)
+    return job
+
+
+async def reopen_job(tx: Tx, job: JobRow, stage: TaskKind, actor: str) -> JobRow:
+    """failed, canceled > queued, with the failed and canceled tasks: queued in `stage`, waiting in later ones."""
+    before = [TaskState.FAILED, TaskState.CANCELED]
+    for state in before:
+        check_task_move(state, TaskState.QUEUED)
+    job = await move_job(tx, job, JobState.QUEUED, actor)
+    parameters = {"job_id": job.id, "stage": stage.value, "before": [state.value for state in before]}
+    rows = await tx.all("reopen_tasks", **parameters)
+    await enqueue(tx, job)
+    await add_event(tx, job.id, "tasks.reopened", actor, detail={"count": len(rows), "stage": stage.value})
+    return job
+
+
+async def enqueue(tx: Tx, job: JobRow) -> None:
+    """Put those of a job's queued tasks into the queue that are not there."""
+    rows = await tx.all("queued_outside_of_queue", job_id=job.id)
+    await queue.defer(tx, job, [(row["id"], TaskKind(row["kind"])) for row in rows])
 
 
 async def move_job(

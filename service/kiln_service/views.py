@@ -1,9 +1,10 @@
 """Jobs and tasks as clients see them, with an honest estimate of the time left."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from psycopg.rows import DictRow
+from psycopg.types.json import Jsonb
 
 from kiln_schemas.errors import InputError, NotFound
 from kiln_schemas.job import JobPage, JobView, StageView, TaskView
@@ -25,13 +26,26 @@ async def job_view(database: Database, job_id: str) -> JobView:
         return (await _views(tx, [JobRow.of(row)]))[0]
 
 
-async def job_page(database: Database, states: Sequence[JobState], cursor: str | None, limit: int) -> JobPage:
-    """Jobs, newest first; `next` is the cursor of the page after."""
+async def job_page(
+    database: Database,
+    *,
+    states: Sequence[JobState] = (),
+    labels: Mapping[str, str] | None = None,
+    text: str | None = None,
+    cursor: str | None = None,
+    limit: int,
+) -> JobPage:
+    """Jobs, newest first, that have all these labels and `text` in their name; `next` is the cursor of the page after.
+
+    Without `states` all but those that are archived.
+    """
     async with database.transaction() as tx:
         rows = await tx.all(
             "page_of_jobs",
             before=cursor,
-            states=[state.value for state in states] or None,
+            states=[state.value for state in states or set(JobState) - {JobState.ARCHIVED}],
+            labels=Jsonb(dict(labels or {})),
+            text=text,
             limit=limit + 1,
         )
         views = await _views(tx, [JobRow.of(row) for row in rows[:limit]])
@@ -144,6 +158,10 @@ def _job_view(job: JobRow, rows: dict[str, DictRow]) -> JobView:
         gates=job.gates,
         cameras=job.cameras,
         gate_results=job.gate_results,
+        priority=job.priority,
+        labels=job.labels,
+        submitter=job.submitter,
+        renders_of=job.renders_of,
     )
 
 

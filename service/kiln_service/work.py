@@ -8,12 +8,13 @@ transaction under the job's lock, so the last tile's fan-in happens once.
 
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
 from typing import Final
 
 from psycopg.types.json import Jsonb
 
 from kiln_schemas.errors import Conflict, InputError, KilnError, NotFound, Problem, StaleAttempt
-from kiln_schemas.states import JobState, TaskState
+from kiln_schemas.states import LIVE_JOB_STATES, JobState, TaskState
 from kiln_schemas.tasks import (
     Checkpoint,
     Claim,
@@ -40,6 +41,7 @@ from kiln_service.ids import new_id
 from kiln_service.jobs import lock_job, settle_cancel, withdraw
 from kiln_service.payloads import build_payload
 from kiln_service.planner import METHODS, plan_after_prepare
+from kiln_service.reuse import renders_to_reuse
 
 RELEASED_CODE: Final = "canceled"
 """A worker that leaves in good order gives its task back with this code; that is no strike against the task."""
@@ -94,7 +96,8 @@ class Work:
                 return _NOTHING
             queue_job, task_id = fetched
             job, task = await lock_task(tx, task_id)
-            if task.state is not TaskState.QUEUED or task.queue_job != queue_job:
+            paused = job.state is JobState.PAUSED
+            if paused or task.state is not TaskState.QUEUED or task.queue_job != queue_job:
                 await queue.finish(tx, queue_job)
                 return _DROPPED
             task = await transitions.claim_task(tx, job, task, worker)
@@ -115,7 +118,7 @@ class Work:
         if row is None:
             return HeartbeatReply(stop=True, reason="the task was given to another attempt or is over")
         state = JobState(row["job_state"])
-        if state in (JobState.QUEUED, JobState.ACTIVE):
+        if state in LIVE_JOB_STATES:
             return HeartbeatReply(stop=False)
         await self._stop_attempt(beat.task_id, beat.attempt, f"the job is {state}")
         return HeartbeatReply(stop=True, reason=f"the job is {state}")
@@ -148,7 +151,7 @@ class Work:
                 return
             _check_fence(task, commit.attempt)
             _check_result(job, task, commit.result)
-            if job.state is not JobState.ACTIVE:
+            if job.state not in LIVE_JOB_STATES:
                 stopped = StaleAttempt(f"the job is {job.state}; the result is not wanted", where=task.label)
                 await transitions.cancel_task(tx, task, transitions.COORDINATOR, stopped.detail)
                 await settle_cancel(tx, job)
@@ -170,7 +173,12 @@ class Work:
                 planned = plan_after_prepare(result, job.settings, job.gates, self._config.limits.tiles)
             except InputError as error:
                 return await transitions.fail_job(tx, job, error.problem(), transitions.COORDINATOR)
-            await transitions.add_tasks(tx, job, planned)
+            source = await renders_to_reuse(tx, job, result)
+            if source is None:
+                await transitions.add_tasks(tx, job, planned)
+            else:
+                await transitions.add_tasks(tx, job, [replace(task, ready=False) for task in planned])
+                await transitions.reuse_renders(tx, job, source.job_id, source.store_url)
         if isinstance(result, PackageResult):
             for artifact in result.artifacts:
                 await tx.run("add_artifact", job_id=job.id, **artifact.model_dump())
@@ -202,7 +210,7 @@ class Work:
 
         Returns queue jobs to withdraw after the transaction. An input error is final, whatever the worker says.
         """
-        if job.state is not JobState.ACTIVE:
+        if job.state not in LIVE_JOB_STATES:
             await transitions.cancel_task(tx, task, actor, f"the job is {job.state}")
             await settle_cancel(tx, job)
             return []
@@ -210,7 +218,8 @@ class Work:
         released = problem.code == RELEASED_CODE
         last = not released and task.strikes + 1 >= self._config.max_attempts
         if retryable and not input_error and not last:
-            await transitions.requeue_task(tx, task, kind, actor, strike=not released, reason=problem.sentence())
+            reason = problem.sentence()
+            await transitions.requeue_task(tx, job, task, kind, actor, strike=not released, reason=reason)
             return []
         return await transitions.fail_task(tx, job, task, problem, actor)
 
@@ -255,7 +264,7 @@ async def _fan_in(tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
         return
     await add_event(tx, job.id, "stage.completed", transitions.COORDINATOR, detail={"kind": task.kind.value})
     for row in await tx.all("tasks_in_state", job_id=job.id, kind=stage, state=TaskState.WAITING):
-        await transitions.release_task(tx, TaskRow.of(row))
+        await transitions.release_task(tx, job, TaskRow.of(row))
 
 
 async def _unfinished(tx: Tx, job: JobRow, kind: TaskKind) -> int:

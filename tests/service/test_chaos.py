@@ -1,4 +1,4 @@
-"""Many workers that finish, fail, vanish, repeat themselves and are canceled, all at once."""
+"""Many workers that finish, fail, vanish, repeat themselves, are paused and canceled, all at once."""
 
 import random
 import threading
@@ -23,6 +23,9 @@ def live(home, jobs, seed, until, result, faults):
         elif dice < 0.20:
             job = chance.choice(jobs)["id"]
             codes = [home.client.post(f"/v1/jobs/{job}/cancel").status_code]
+        elif dice < 0.28:
+            job, action = chance.choice(jobs)["id"], chance.choice(("pause", "resume"))
+            codes = [home.client.post(f"/v1/jobs/{job}/{action}").status_code]
         else:
             worker.beat(claim, log="x\n")
             document = result(home, claim, tiles=6, has_environment=True)
@@ -33,7 +36,9 @@ def live(home, jobs, seed, until, result, faults):
 def test_everything_ends_well(start, fast, result, eventually):
     timing = fast.model_copy(update={"stale_s": 0.5})
     with start(timing=timing, max_attempts=1000) as home:
-        jobs, faults = [home.submit(name=f"job {i}") for i in range(12)], []
+        # The first six have light of their own; of the others some find theirs rendered.
+        light = [f"render.samples={8 + min(i, 6)}" for i in range(12)]
+        jobs, faults = [home.submit(name=f"job {i}", set=[light[i]]) for i in range(12)], []
         until = time.monotonic() + SECONDS
         threads = [threading.Thread(target=live, args=(home, jobs, i, until, result, faults)) for i in range(WORKERS)]
         for thread in threads:
@@ -42,6 +47,8 @@ def test_everything_ends_well(start, fast, result, eventually):
             thread.join()
         assert faults == []
 
+        for job in jobs:
+            home.client.post(f"/v1/jobs/{job['id']}/resume")
         closer = home.worker("closer")
         deadline = time.monotonic() + 30
         while {home.job(job["id"])["state"] for job in jobs} - {"completed", "canceled"}:
@@ -57,10 +64,12 @@ def test_everything_ends_well(start, fast, result, eventually):
 
 def check(home, job):
     """The history of a finished job is one that could have happened without any fault."""
-    kinds = [event["kind"] for event in home.events(job["id"])]
+    events = home.events(job["id"])
+    kinds = [event["kind"] for event in events]
+    reused = sum(event["detail"]["count"] for event in events if event["kind"] == "tasks.reused")
     tasks = home.tasks(job["id"])
     assert {task["state"] for task in tasks} <= {"completed", "canceled"}
-    assert kinds.count("task.completed") == sum(task["state"] == "completed" for task in tasks)
+    assert kinds.count("task.completed") + reused == sum(task["state"] == "completed" for task in tasks)
     if job["state"] == "completed":
         assert [(s["kind"], s["total"]) for s in job["stages"]] == [
             ("prepare", 1),
@@ -70,4 +79,5 @@ def check(home, job):
             ("package", 1),
         ]
         assert all(task["state"] == "completed" for task in tasks)
-        assert kinds.count("stage.completed") == 4 and kinds.count("job.completed") == 1
+        assert kinds.count("stage.completed") == (3 if reused else 4) and reused in (0, 6)
+        assert kinds.count("job.completed") == 1

@@ -170,14 +170,12 @@ def test_an_old_database_keeps_its_jobs(start, dsn, monkeypatch):
         with pytest.raises(psycopg.errors.CheckViolation):
             connection.execute(insert, ["d" * 32, "a" * 32, "refine"])
     with start() as home:
-        assert home.sql("SELECT version FROM kiln_migrations ORDER BY version") == [
-            {"version": 1},
-            {"version": 2},
-            {"version": 3},
-        ]
+        versions = [row["version"] for row in home.sql("SELECT version FROM kiln_migrations ORDER BY version")]
+        assert versions == list(range(1, len(known) + 1)) and len(known) >= 4
         for job_id, state in jobs.items():
             view = home.job(job_id)
             assert (view["name"], view["state"], view["gate_results"], view["cameras"]) == ("old", state, [], {})
+            assert (view["priority"], view["labels"], view["renders_of"]) == (50, {}, None)
             assert view["gates"] == {"log_mse_rel": None, "visibility_log_mse_rel": None, "flip": {}}
         assert home.sql("SELECT kind FROM tasks") == [{"kind": "package"}]
         home.sql("UPDATE tasks SET kind = 'refine'")

@@ -22,9 +22,9 @@ def moves(row, job):
     worker = WorkerRow(id=row.worker_id or "", name="w", kinds=(), queue_worker=1)
     problem = transitions.IllegalTransition("x").problem()
     return {
-        "release": lambda tx: transitions.release_task(tx, row),
+        "release": lambda tx: transitions.release_task(tx, job, row),
         "claim": lambda tx: transitions.claim_task(tx, job, row, worker),
-        "requeue": lambda tx: transitions.requeue_task(tx, row, "task.retried", "test", strike=True, reason=""),
+        "requeue": lambda tx: transitions.requeue_task(tx, job, row, "task.retried", "test", strike=True, reason=""),
         "fail": lambda tx: transitions.fail_task(tx, job, row, problem, "test"),
         "cancel": lambda tx: transitions.cancel_task(tx, row, "test", ""),
     }

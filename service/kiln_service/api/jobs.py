@@ -6,7 +6,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 
 from kiln_schemas.errors import InputError
-from kiln_schemas.job import EventView, JobPage, JobRequest, JobView, TaskView
+from kiln_schemas.job import EventView, JobChange, JobPage, JobRequest, JobView, TaskView, read_labels
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
 from kiln_service import jobs, views
@@ -23,9 +23,18 @@ Submitter = Annotated[Principal, Depends(caller(Scope.SUBMIT))]
 
 
 @router.post("/jobs", status_code=201, responses=problems(409, 413, 422))
-async def submit(request: JobRequest, parts: PartsHere, who: Submitter, response: Response) -> JobView:
+async def submit(
+    request: JobRequest,
+    parts: PartsHere,
+    who: Submitter,
+    response: Response,
+    idempotency_key: Annotated[
+        str | None,
+        Header(min_length=1, max_length=255, description="a request sent twice under a key makes one job"),
+    ] = None,
+) -> JobView:
     """Submit a bake of files that were uploaded before."""
-    job = await jobs.submit(parts.database, parts.config, request, who.actor)
+    job = await jobs.submit(parts.database, parts.config, request, who, idempotency_key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return await views.job_view(parts.database, job.id)
 
@@ -33,13 +42,26 @@ async def submit(request: JobRequest, parts: PartsHere, who: Submitter, response
 @router.get("/jobs", dependencies=[Reader], responses=problems(422))
 async def list_jobs(
     parts: PartsHere,
-    state: Annotated[list[JobState] | None, Query(description="only jobs in one of these states")] = None,
+    state: Annotated[
+        list[JobState] | None, Query(description="only jobs in one of these states; else all that are not archived")
+    ] = None,
+    label: Annotated[
+        list[str] | None, Query(max_length=32, description="KEY=VALUE; only jobs with all of these labels")
+    ] = None,
+    q: Annotated[str | None, Query(max_length=128, description="only jobs with this in their name")] = None,
     cursor: Annotated[str | None, Query(description="`next` of the page before")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 50,
 ) -> JobPage:
     """Jobs, newest first."""
     size = min(limit, parts.config.limits.page)
-    return await views.job_page(parts.database, state or (), views.parse_cursor(cursor), size)
+    return await views.job_page(
+        parts.database,
+        states=state or (),
+        labels=read_labels(label or (), "label"),
+        text=q,
+        cursor=views.parse_cursor(cursor),
+        limit=size,
+    )
 
 
 @router.get("/jobs/{job_id}", dependencies=[Reader], responses=problems(404))
@@ -52,6 +74,41 @@ async def job(job_id: str, parts: PartsHere) -> JobView:
 async def cancel(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
     """Ask the job to stop; it is canceled once its running tasks have stopped."""
     await jobs.cancel(parts.database, job_id, who.actor)
+    return await views.job_view(parts.database, job_id)
+
+
+@router.patch("/jobs/{job_id}", responses=problems(404, 422))
+async def change(job_id: str, wanted: JobChange, parts: PartsHere, who: Submitter) -> JobView:
+    """Rank the job anew among those that wait, or label it anew."""
+    await jobs.change(parts.database, job_id, wanted, who.actor)
+    return await views.job_view(parts.database, job_id)
+
+
+@router.post("/jobs/{job_id}/pause", responses=problems(404, 409))
+async def pause(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
+    """Give no more of its tasks to workers; those that run go on to their end."""
+    await jobs.pause(parts.database, job_id, who.actor)
+    return await views.job_view(parts.database, job_id)
+
+
+@router.post("/jobs/{job_id}/resume", responses=problems(404, 409))
+async def resume(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
+    """Go on with a paused job."""
+    await jobs.resume(parts.database, job_id, who.actor)
+    return await views.job_view(parts.database, job_id)
+
+
+@router.post("/jobs/{job_id}/retry", responses=problems(404, 409))
+async def retry(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
+    """Do a failed or canceled job's unfinished tasks again; what has completed stays."""
+    await jobs.retry(parts.database, job_id, who.actor)
+    return await views.job_view(parts.database, job_id)
+
+
+@router.post("/jobs/{job_id}/archive", responses=problems(404, 409))
+async def archive(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
+    """Put a job that is over aside: lists leave it out unless asked for."""
+    await jobs.archive(parts.database, job_id, who.actor)
     return await views.job_view(parts.database, job_id)
 
 

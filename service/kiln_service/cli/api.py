@@ -7,17 +7,18 @@ exceptions of their code (`kiln_schemas.errors`).
 import hashlib
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 from urllib.parse import quote
 
 import httpx
 from pydantic import TypeAdapter
 
 from kiln_schemas.errors import AuthError, Unreachable, error_of_answer
-from kiln_schemas.job import JobPage, JobRequest, JobView, MissingReply, MissingRequest, TaskView
+from kiln_schemas.job import JobChange, JobPage, JobRequest, JobView, MissingReply, MissingRequest, TaskView
+from kiln_schemas.states import JobState
 from kiln_schemas.tasks import Artifact, TaskKind
 
 CHUNK: Final = 1 << 20
@@ -74,17 +75,23 @@ class Api:
             lambda: self._http.put(f"/v1/blobs/{sha256}", content=_pieces(path, on_bytes), headers=headers, timeout=300)
         )
 
-    def submit(self, request: JobRequest) -> JobView:
-        """Submit a job whose files are uploaded."""
-        reply = self._call("POST", "/v1/jobs", json=request.model_dump(mode="json"))
+    def submit(self, request: JobRequest, key: str | None = None) -> JobView:
+        """Submit a job whose files are uploaded; a repetition under the same `key` makes no second job."""
+        headers = {"Idempotency-Key": key} if key else {}
+        reply = self._call("POST", "/v1/jobs", json=request.model_dump(mode="json"), headers=headers)
         return JobView.model_validate_json(reply.content)
 
     def job(self, job_id: str) -> JobView:
         return JobView.model_validate_json(self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}").content)
 
-    def jobs(self, limit: int = 50) -> JobPage:
-        """The newest jobs."""
-        return JobPage.model_validate_json(self._call("GET", "/v1/jobs", params={"limit": limit}).content)
+    def jobs(
+        self, limit: int = 50, *, labels: Sequence[str] = (), text: str | None = None, states: Sequence[JobState] = ()
+    ) -> JobPage:
+        """The newest jobs with all these labels (KEY=VALUE), `text` in their name and one of these states."""
+        params: dict[str, Any] = {"limit": limit, "label": list(labels), "state": [state.value for state in states]}
+        if text is not None:
+            params["q"] = text
+        return JobPage.model_validate_json(self._call("GET", "/v1/jobs", params=params).content)
 
     def tasks(self, job_id: str, kind: TaskKind | None = None) -> tuple[TaskView, ...]:
         """A job's tasks, all or of one kind."""
@@ -92,9 +99,18 @@ class Api:
         reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/tasks", params=params)
         return TypeAdapter(tuple[TaskView, ...]).validate_json(reply.content)
 
-    def cancel(self, job_id: str) -> JobView:
-        """Ask a job to stop."""
-        return JobView.model_validate_json(self._call("POST", f"/v1/jobs/{quote(job_id, safe='')}/cancel").content)
+    def act(self, job_id: str, action: Literal["pause", "resume", "cancel", "retry", "archive"]) -> JobView:
+        """Ask something of a job."""
+        return JobView.model_validate_json(self._call("POST", f"/v1/jobs/{quote(job_id, safe='')}/{action}").content)
+
+    def change(self, job_id: str, wanted: JobChange) -> JobView:
+        """Rank or label a job anew."""
+        body = wanted.model_dump(mode="json", exclude_none=True)
+        return JobView.model_validate_json(self._call("PATCH", f"/v1/jobs/{quote(job_id, safe='')}", json=body).content)
+
+    def task_log(self, task_id: str) -> str:
+        """What the attempts of a task wrote."""
+        return self._call("GET", f"/v1/tasks/{quote(task_id, safe='')}/log").text
 
     def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
         """What a job published."""
@@ -130,9 +146,15 @@ class Api:
         self._patiently(attempt)
 
     def _call(
-        self, method: str, path: str, *, json: Any = None, params: Mapping[str, str | int] | None = None
+        self,
+        method: str,
+        path: str,
+        *,
+        json: Any = None,
+        params: Mapping[str, Any] | None = None,
+        headers: Mapping[str, str] | None = None,
     ) -> httpx.Response:
-        return self._patiently(lambda: self._http.request(method, path, json=json, params=params))
+        return self._patiently(lambda: self._http.request(method, path, json=json, params=params, headers=headers))
 
     def _patiently(self, attempt: Callable[[], httpx.Response]) -> httpx.Response:
         """The first answer that is not an outage; the coordinator's errors are raised."""

@@ -44,6 +44,24 @@ def download_package(api: Api, job_id: str, out: Path, *, force: bool = False, b
     return [out / artifact.name for artifact in artifacts]
 
 
+def damaged_files(folder: Path) -> tuple[int, list[str]]:
+    """How many files a package's manifest names, and those that are missing or differ from it."""
+    path = folder / MANIFEST_JSON
+    try:
+        entries = [Artifact.model_validate(entry) for entry in json.loads(path.read_text())["files"]]
+        names = [check_bundle_path(entry.name) for entry in entries]
+    except OSError as error:
+        reason = error.strerror or "it cannot be read"
+        raise InputError(reason, where=str(path), remedy="Name the folder of a package.") from None
+    except (ValueError, KeyError, TypeError):
+        raise InputError("this is not a manifest that lightkiln wrote", where=str(path)) from None
+    whole = [
+        (folder / name).is_file() and sha256_of(folder / name) == e.sha256
+        for name, e in zip(names, entries, strict=True)
+    ]
+    return len(names), [name for name, good in zip(names, whole, strict=True) if not good]
+
+
 def remove_package(out: Path) -> None:
     """Remove the files that the manifest in `out` names, the manifest first; nothing where there is none."""
     manifest = out / MANIFEST_JSON

@@ -12,8 +12,8 @@ from kiln_service.cli.fetch import writing
 
 
 def end_of(job: JobView) -> Problem | None:
-    """What a job that is over ended with; None where it completed."""
-    if job.state is JobState.COMPLETED:
+    """What a job that is over ended with; None where it completed. An archived one is told by its error."""
+    if job.state is JobState.COMPLETED or (job.state is JobState.ARCHIVED and job.error is None):
         return None
     if job.state is JobState.CANCELED:
         return Canceled(f"the job {job.id} was canceled").problem()

@@ -18,9 +18,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from kiln_schemas import __version__
-from kiln_schemas.errors import DISK_FULL, KilnError, MachineLacks
+from kiln_schemas.errors import DISK_FULL, InputError, KilnError, MachineLacks
 from kiln_schemas.gates import check_gates, read_cameras, read_gates
-from kiln_schemas.job import JobRequest
+from kiln_schemas.job import DEFAULT_PRIORITY, JobRequest, JobView, read_labels
 from kiln_schemas.settings import make_settings
 from kiln_schemas.states import FINAL_JOB_STATES, PUBLISHED_JOB_STATES, JobState
 from kiln_schemas.tasks import TaskKind
@@ -30,8 +30,9 @@ from kiln_service.cli.become import become
 from kiln_service.cli.bundle import collect
 from kiln_service.cli.compare import add_compare_command
 from kiln_service.cli.doctor import examine
-from kiln_service.cli.fetch import download_package
+from kiln_service.cli.fetch import damaged_files, download_package
 from kiln_service.cli.gates import end_of, raise_if_missed, raise_unless_completed, write_junit
+from kiln_service.cli.jobs import add_job_commands
 from kiln_service.cli.output import (
     defect,
     duration,
@@ -187,12 +188,26 @@ def submit(
     gate: options.Gate = None,
     camera: options.Cameras = None,
     name: Annotated[str | None, typer.Option("--name", help="The job's name; the file's by default.")] = None,
+    priority: options.JobPriority = DEFAULT_PRIORITY,
+    label: options.Label = None,
+    key: Annotated[
+        str | None,
+        typer.Option("--idempotency-key", help="Sent twice under the same key, a request makes one job."),
+    ] = None,
+    wait: Annotated[bool, typer.Option("--wait", help="Until it is over; the exit code tells how it ended.")] = False,
+    junit: options.Junit = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="With --wait: download the package into DIR.")
+    ] = None,
     url: options.Url = options.DEFAULT_URL,
     token: options.Token = None,
     data: options.Data = None,
     json: options.Json = False,
 ) -> None:
-    """Upload a scene and submit a job to a coordinator."""
+    """Upload a scene and submit a job to a coordinator; --wait follows it to its end."""
+    for flag, value in (("--junit", junit), ("--out", out)):
+        if value is not None and not wait:
+            raise typer.BadParameter("needs --wait", param_hint=flag)
     make_settings(preset, overrides or ())
     cameras = read_cameras(camera or ())
     gates = check_gates(read_gates(gate or ()), cameras)
@@ -204,18 +219,39 @@ def submit(
         set=tuple(overrides or ()),
         gates=gates,
         cameras=cameras,
+        priority=priority,
+        labels=read_labels(label or ()),
     )
     with options.connect(url, token, data) as api:
-        job = upload_and_submit(api, local, request)
+        job = upload_and_submit(api, local, request, key=key)
+    if not wait:
+        if json:
+            print_json(job)
+        else:
+            results.print(job.id, markup=False)
+        return
+    if not json:
+        results.print(job.id, markup=False)
+    # A coordinator that is restarted meanwhile does not end the waiting.
+    with options.connect(url, token, data, patience_s=60) as api:
+        with make_display(quiet=json) as display:
+            job = follow(api, job.id, display)
+        write_junit(junit, job)
+        if out is not None and job.state in PUBLISHED_JOB_STATES:
+            download_package(api, job.id, out, force=False)
     if json:
         print_json(job)
-    else:
-        results.print(job.id, markup=False)
+    _exit_as_ended(job, json=json)
 
 
 @app.command()
 def status(
     job: Annotated[str | None, typer.Argument(metavar="JOB", help="All recent jobs without it.")] = None,
+    label: options.Label = None,
+    text: Annotated[str | None, typer.Option("--name", help="Only jobs with this in their name.")] = None,
+    state: Annotated[
+        list[JobState] | None, typer.Option("--state", help="Only jobs in this state; archived ones only with it.")
+    ] = None,
     url: options.Url = options.DEFAULT_URL,
     token: options.Token = None,
     data: options.Data = None,
@@ -224,13 +260,15 @@ def status(
     """Show one job, or the newest ones."""
     with options.connect(url, token, data) as api:
         if job is None:
-            page = api.jobs()
+            page = api.jobs(labels=label or (), text=text, states=state or ())
             if json:
                 print_json(page)
                 return
-            table = Table("job", "name", "state", "created", box=None)
+            table = Table("job", "name", "state", "priority", "labels", "created", box=None)
             for view in page.jobs:
-                table.add_row(view.id, escape(view.name), view.state.value, f"{view.created:%Y-%m-%d %H:%M}")
+                words = ", ".join(f"{key}={value}" for key, value in view.labels.items())
+                cells = (view.id, escape(view.name), view.state.value, str(view.priority), escape(words))
+                table.add_row(*cells, f"{view.created:%Y-%m-%d %H:%M}")
             results.print(table)
             return
         view = api.job(job)
@@ -260,28 +298,15 @@ def watch(
     with options.connect(url, token, data, patience_s=60) as api, make_display(quiet=json) as display:
         view = follow(api, job, display, on_change=print_json if json else None)
     write_junit(junit, view)
-    ended = end_of(view)
+    _exit_as_ended(view, json=json)
+
+
+def _exit_as_ended(job: JobView, *, json: bool) -> None:
+    """End with the code of a job that is over; with --json its last document has told the error already."""
+    ended = end_of(job)
     if json and ended is not None:
-        # The last line already tells the error; only the code is missing.
         raise typer.Exit(KilnError.from_problem(ended).exit_code)
-    raise_unless_completed(view)
-
-
-@app.command()
-def cancel(
-    job: options.JobId,
-    url: options.Url = options.DEFAULT_URL,
-    token: options.Token = None,
-    data: options.Data = None,
-    json: options.Json = False,
-) -> None:
-    """Ask a job to stop."""
-    with options.connect(url, token, data) as api:
-        view = api.cancel(job)
-    if json:
-        print_json(view)
-    else:
-        results.print(f"{view.name}: {view.state.value}", markup=False)
+    raise_unless_completed(job)
 
 
 @app.command()
@@ -308,6 +333,24 @@ def download(
         print_json({"out": str(out), "files": [str(path.relative_to(out)) for path in files]})
     else:
         results.print(f"{len(files)} files in {shown_path(out.absolute())}", markup=False)
+
+
+@app.command()
+def verify(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A package.")], json: options.Json = False
+) -> None:
+    """Check a package's files against the hashes in its manifest."""
+    count, damaged = damaged_files(folder)
+    if damaged:
+        raise InputError(
+            f"{len(damaged)} of {count} files are missing or changed: {', '.join(damaged[:8])}",
+            where=str(folder),
+            remedy="Download the package again.",
+        )
+    if json:
+        print_json({"out": str(folder), "files": count})
+    else:
+        results.print(f"{count} files are as the manifest says.", markup=False)
 
 
 @app.command()
@@ -344,6 +387,7 @@ def examples_write(
         results.print("\n".join(files), markup=False, soft_wrap=True)
 
 
+add_job_commands(app)
 add_picture_commands(app)
 add_compare_command(app)
 

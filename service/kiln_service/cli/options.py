@@ -49,6 +49,12 @@ Cameras = Annotated[
 Junit = Annotated[
     Path | None, typer.Option("--junit", metavar="FILE", help="Write the gates' results as JUnit XML when it is over.")
 ]
+JobPriority = Annotated[
+    int, typer.Option("--priority", min=0, max=100, help="Of two jobs that wait the greater goes first.")
+]
+Label = Annotated[
+    list[str] | None, typer.Option("--label", metavar="KEY=VALUE", help="To find jobs by; may be repeated.")
+]
 Environment = Annotated[
     Path | None, typer.Option("--env", metavar="FILE", help="Distant light: an equirectangular HDR or EXR.")
 ]

@@ -1,5 +1,7 @@
 """Send a bundle: only the files that the coordinator lacks, with a bar, then the job."""
 
+from uuid import uuid4
+
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 
 from kiln_schemas.job import JobRequest, JobView
@@ -8,8 +10,13 @@ from kiln_service.cli.bundle import LocalBundle
 from kiln_service.cli.output import notices
 
 
-def upload_and_submit(api: Api, local: LocalBundle, request: JobRequest, *, bar: bool = True) -> JobView:
-    """Upload what is missing, with a bar on a terminal if `bar`, and submit."""
+def upload_and_submit(
+    api: Api, local: LocalBundle, request: JobRequest, *, key: str | None = None, bar: bool = True
+) -> JobView:
+    """Upload what is missing, with a bar on a terminal if `bar`, and submit under an `Idempotency-Key`.
+
+    Without `key` one of its own is made, so that a request whose answer was lost makes no second job.
+    """
     files = local.by_hash()
     missing = api.missing(files)
     columns = (TextColumn("uploading"), BarColumn(), DownloadColumn())
@@ -17,4 +24,4 @@ def upload_and_submit(api: Api, local: LocalBundle, request: JobRequest, *, bar:
         row = shown.add_task("uploading", total=sum(files[sha256].stat().st_size for sha256 in missing))
         for sha256 in missing:
             api.put_blob(sha256, files[sha256], lambda size: shown.advance(row, size))
-    return api.submit(request)
+    return api.submit(request, key or uuid4().hex)

@@ -34,6 +34,11 @@ class JobRow(_Row):
     cameras: dict[str, Camera]
     gate_results: tuple[GateResult, ...]
     store_url: str
+    priority: int
+    labels: dict[str, str]
+    submitter: str | None
+    request_sha256: str | None
+    renders_of: str | None
     notes: tuple[str, ...]
     error: Problem | None
     created: datetime

@@ -2,8 +2,13 @@
 
 -- name: insert_job
 -- A new job.
-INSERT INTO jobs (id, name, method, state, settings, bundle, gates, cameras, store_url)
-VALUES (%(id)s, %(name)s, %(method)s, 'queued', %(settings)s, %(bundle)s, %(gates)s, %(cameras)s, %(store_url)s)
+INSERT INTO jobs (
+    id, name, method, state, settings, bundle, gates, cameras, store_url, priority, labels, submitter,
+    idempotency_key, request_sha256
+) VALUES (
+    %(id)s, %(name)s, %(method)s, 'queued', %(settings)s, %(bundle)s, %(gates)s, %(cameras)s, %(store_url)s,
+    %(priority)s, %(labels)s, %(submitter)s, %(idempotency_key)s, %(request_sha256)s
+)
 RETURNING *;
 
 -- name: insert_tasks
@@ -18,9 +23,9 @@ FROM jsonb_to_recordset(%(tasks)s)
 -- Move a job, with the times and the error that belong to the move.
 UPDATE jobs
 SET state = %(after)s,
-    error = COALESCE(%(error)s, error),
-    started = CASE WHEN %(after)s::text = 'active' THEN now() ELSE started END,
-    finished = CASE WHEN %(final)s THEN now() ELSE finished END
+    error = CASE WHEN %(after)s::text = 'queued' THEN NULL ELSE COALESCE(%(error)s, error) END,
+    started = CASE WHEN %(after)s::text = 'active' THEN COALESCE(started, now()) ELSE started END,
+    finished = CASE WHEN %(after)s::text = 'queued' THEN NULL WHEN %(final)s THEN COALESCE(finished, now()) ELSE finished END
 WHERE id = %(id)s AND state = %(before)s;
 
 -- name: move_task_queued
@@ -60,3 +65,21 @@ UPDATE tasks
 SET state = 'canceled', finished = now()
 WHERE job_id = %(job_id)s AND state = ANY(%(before)s)
 RETURNING id, queue_job, checkpoint;
+
+-- name: reopen_tasks
+-- failed, canceled > queued in the stage that the job has come to, > waiting in later ones.
+UPDATE tasks
+SET state = CASE WHEN kind = %(stage)s THEN 'queued' ELSE 'waiting' END,
+    strikes = 0, error = NULL, progress = NULL, worker_id = NULL, checkpoint = NULL, queue_job = NULL,
+    started = NULL, finished = NULL, heartbeat = NULL
+WHERE job_id = %(job_id)s AND state = ANY(%(before)s)
+RETURNING id, kind, state;
+
+-- name: reuse_results
+-- waiting > completed: tasks of a kind whose results another job has under the same labels.
+UPDATE tasks
+SET state = 'completed', result = done.result, started = now(), finished = now()
+FROM tasks AS done
+WHERE tasks.job_id = %(job_id)s AND tasks.kind = %(kind)s AND tasks.state = %(before)s
+  AND done.job_id = %(source)s AND done.kind = tasks.kind AND done.label = tasks.label AND done.state = 'completed'
+RETURNING tasks.id;

@@ -9,9 +9,12 @@ SELECT * FROM jobs WHERE id = %(id)s;
 SELECT state FROM jobs WHERE id = %(id)s;
 
 -- name: page_of_jobs
--- Jobs, newest first, before a cursor and in one of the states.
+-- Jobs, newest first, before a cursor, in one of the states, with all the labels and the text in their name.
 SELECT * FROM jobs
-WHERE (%(before)s::text IS NULL OR id < %(before)s) AND (%(states)s::text[] IS NULL OR state = ANY(%(states)s))
+WHERE (%(before)s::text IS NULL OR id < %(before)s)
+  AND state = ANY(%(states)s)
+  AND labels @> %(labels)s
+  AND (%(text)s::text IS NULL OR position(lower(%(text)s) IN lower(name)) > 0)
 ORDER BY id DESC
 LIMIT %(limit)s;
 

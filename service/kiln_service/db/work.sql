@@ -98,6 +98,62 @@ SELECT lines FROM task_logs WHERE task_id = %(task_id)s ORDER BY id DESC LIMIT 2
 -- Publish an attempt's checkpoint: progress was made, so earlier failures count no more.
 UPDATE tasks SET checkpoint = %(sha256)s, strikes = 0, heartbeat = now() WHERE id = %(id)s;
 
+-- name: queued_queue_jobs
+-- The queue jobs of a job's tasks that no worker has.
+SELECT queue_job FROM tasks WHERE job_id = %(job_id)s AND state = 'queued' AND queue_job IS NOT NULL;
+
+-- name: queued_outside_of_queue
+-- A job's queued tasks that nothing in the queue will bring to a worker.
+SELECT tasks.id, tasks.kind FROM tasks
+LEFT JOIN procrastinate_jobs AS queue ON queue.id = tasks.queue_job AND queue.status = 'todo'
+WHERE tasks.job_id = %(job_id)s AND tasks.state = 'queued' AND queue.id IS NULL
+ORDER BY tasks.ordinal;
+
+-- name: first_unfinished
+-- Kinds of a job's tasks that have not all completed.
+SELECT DISTINCT kind FROM tasks WHERE job_id = %(job_id)s AND state <> 'completed';
+
+-- name: change_job
+-- Rank or label a job anew; NULL keeps what there is.
+UPDATE jobs
+SET priority = COALESCE(%(priority)s, priority), labels = COALESCE(%(labels)s, labels)
+WHERE id = %(id)s;
+
+-- name: rank_queue_jobs
+-- The same in the queue, for tasks that wait there; the queue's priority is the job's times %(step)s plus its kind's.
+UPDATE procrastinate_jobs AS queue
+SET priority = %(priority)s * %(step)s + queue.priority - (queue.priority / %(step)s) * %(step)s
+FROM tasks
+WHERE tasks.job_id = %(job_id)s AND queue.id = tasks.queue_job AND queue.status = 'todo';
+
+-- name: lock_idempotency_key
+-- Let one of several identical submissions in at a time; held until the transaction ends.
+SELECT pg_advisory_xact_lock(hashtextextended(%(key)s, 0));
+
+-- name: find_submission
+-- The job that a submission with this key has made.
+SELECT * FROM jobs WHERE submitter = %(submitter)s AND idempotency_key = %(key)s;
+
+-- name: set_render_key
+-- What the light fields of a prepared job depend on.
+UPDATE jobs SET render_key = %(key)s WHERE id = %(id)s;
+
+-- name: find_renders
+-- The newest other job whose light fields are the same and all there, and that has what the descent learns from.
+SELECT jobs.id, jobs.store_url FROM jobs
+JOIN tasks AS prepared ON prepared.job_id = jobs.id AND prepared.kind = 'prepare' AND prepared.state = 'completed'
+WHERE jobs.render_key = %(key)s AND jobs.id <> %(id)s AND jobs.method = %(method)s
+  AND (%(between)s::jsonb = '[]' OR COALESCE(prepared.result -> 'between', '[]') = %(between)s)
+  AND NOT EXISTS (
+      SELECT FROM tasks WHERE tasks.job_id = jobs.id AND tasks.kind = 'render' AND tasks.state <> 'completed'
+  )
+ORDER BY jobs.id DESC
+LIMIT 1;
+
+-- name: share_renders
+-- Read the light fields of another job from now on.
+UPDATE jobs SET store_url = %(store_url)s, renders_of = %(source)s WHERE id = %(id)s;
+
 -- name: add_notes
 -- Append to what a job tells its user.
 UPDATE jobs SET notes = notes || %(notes)s WHERE id = %(id)s;
@@ -122,8 +178,9 @@ ORDER BY heartbeat;
 SELECT heartbeat < now() - make_interval(secs => %(seconds)s) AS stale FROM tasks WHERE id = %(id)s;
 
 -- name: queued_without_queue_job
--- Queued tasks that nothing in the queue will bring to a worker.
+-- Queued tasks of jobs that are not paused, which nothing in the queue will bring to a worker.
 SELECT tasks.id, tasks.job_id FROM tasks
+JOIN jobs ON jobs.id = tasks.job_id AND jobs.state <> 'paused'
 LEFT JOIN procrastinate_jobs AS queue ON queue.id = tasks.queue_job AND queue.status = 'todo'
 WHERE tasks.state = 'queued' AND queue.id IS NULL;
 
