@@ -124,6 +124,10 @@ class StaleAttempt(Conflict):
     code, title = "stale-attempt", "The task was given to another attempt"
 
 
+class Drained(Conflict):
+    code, title = "drained", "The worker was told to leave"
+
+
 class IllegalTransition(Conflict):
     code, title = "illegal-transition", "The state does not allow this"
 

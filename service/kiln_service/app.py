@@ -14,15 +14,17 @@ from fastapi.responses import JSONResponse
 
 from kiln_schemas import __version__
 from kiln_schemas.errors import InputError
+from kiln_schemas.operators import Scope
 from kiln_service import problems
 from kiln_service.api import blobs as blob_routes
 from kiln_service.api import health as health_routes
 from kiln_service.api import jobs as job_routes
+from kiln_service.api import operators as operator_routes
 from kiln_service.api import workers as worker_routes
 from kiln_service.api.common import PROBLEM_SCHEMA, Parts, caller
 from kiln_service.auth import TokenBook, own_token
 from kiln_service.blobs import Blobs
-from kiln_service.config import Scope, ServiceConfig
+from kiln_service.config import ServiceConfig
 from kiln_service.db import Database
 from kiln_service.db.migrate import migrate
 from kiln_service.events import Signals
@@ -43,7 +45,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         docs_url=None,
         redoc_url=None,
     )
-    for module in (job_routes, blob_routes, worker_routes, health_routes):
+    for module in (job_routes, blob_routes, worker_routes, operator_routes, health_routes):
         app.include_router(module.router)
 
     @app.get("/v1/openapi.json", tags=["health"], dependencies=[Depends(caller(Scope.READ))])

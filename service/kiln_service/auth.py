@@ -1,23 +1,29 @@
 """Bearer tokens (RFC 6750): who calls, and what they may do.
 
 The coordinator keeps hashes of tokens and compares digests in constant time. The embedded default has one
-token with every scope, in the file `token` of the data folder, readable by its owner only.
+token with every scope, in the file `token` of the data folder, readable by its owner only. Others are in the
+configuration, or were made by an operator (`operators.create_token`) and are looked up in the database.
 """
 
 import hashlib
 import hmac
 import os
 import secrets
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from kiln_schemas.errors import AuthError, Forbidden
-from kiln_service.config import Scope, TokenEntry
+from kiln_schemas.operators import Scope
+from kiln_service.config import OWN_TOKEN, TokenEntry
+from kiln_service.db import Database
 
 TOKEN_FILE: Final = "token"
-OWNER: Final = "owner"
+MEMORY_S: Final = 2.0
+"""A token of the database is remembered for so long: a revoked one is refused after that at the latest."""
+MEMORY_SIZE: Final = 4096
 
 
 @dataclass(frozen=True)
@@ -47,8 +53,9 @@ class TokenBook:
 
     def __init__(self, entries: Sequence[TokenEntry]) -> None:
         self._entries = tuple(entries)
+        self._remembered: dict[str, tuple[Principal, float]] = {}
 
-    def authenticate(self, header: str | None) -> Principal:
+    async def authenticate(self, header: str | None, database: Database) -> Principal:
         """The caller with this Authorization header; AuthError where there is none or the token is unknown."""
         if not header:
             raise AuthError(
@@ -62,13 +69,36 @@ class TokenBook:
         for entry in self._entries:  # all of them, so that the time tells nothing
             if hmac.compare_digest(entry.sha256, digest):
                 found = entry
-        if scheme.lower() != "bearer" or found is None:
+        bearer = scheme.lower() == "bearer"
+        if bearer and found is not None:
+            return Principal(found.name, frozenset(found.scopes))
+        stored = await self._stored(digest, database) if bearer else None
+        if stored is None:
             raise AuthError(
                 "the token is not known here",
                 where="Authorization",
                 remedy="Check the token and the coordinator's URL.",
             )
-        return Principal(found.name, frozenset(found.scopes))
+        return stored
+
+    async def _stored(self, digest: str, database: Database) -> Principal | None:
+        """Whose token of the database has this hash, as of MEMORY_S ago or later."""
+        now = time.monotonic()
+        principal, until = self._remembered.get(digest, (None, 0.0))
+        if principal is not None and now < until:
+            return principal
+        self._remembered.pop(digest, None)
+        async with database.transaction() as tx:
+            row = await tx.maybe("find_token", sha256=digest)
+            if row is None:
+                return None
+            if row["unnoticed"]:
+                await tx.run("use_token", sha256=digest)
+        principal = Principal(row["name"], frozenset(Scope(scope) for scope in row["scopes"]))
+        if len(self._remembered) >= MEMORY_SIZE:
+            self._remembered.clear()
+        self._remembered[digest] = principal, now + MEMORY_S
+        return principal
 
 
 def own_token(data: Path) -> TokenEntry:
@@ -89,4 +119,4 @@ def own_token(data: Path) -> TokenEntry:
         finally:
             draft.unlink()
     digest = hashlib.sha256(path.read_text().strip().encode()).hexdigest()
-    return TokenEntry(name=OWNER, sha256=digest, scopes=(Scope.ADMIN,))
+    return TokenEntry(name=OWN_TOKEN, sha256=digest, scopes=(Scope.ADMIN,))

@@ -4,28 +4,18 @@
 not in it: access tokens appear as hashes only (`auth.py`).
 """
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from pydantic import Field, ValidationError, field_validator
 
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import InputError
+from kiln_schemas.operators import Scope
 from kiln_schemas.tasks import Sha256
 
-
-class Scope(StrEnum):
-    """What a token allows; every route names the one it needs."""
-
-    READ = "read"
-    """Look at jobs, tasks, events; download artifacts and blobs."""
-    SUBMIT = "submit"
-    """Upload blobs, submit and cancel jobs."""
-    WORKER = "worker"
-    """Claim tasks, upload and download their blobs, commit them."""
-    ADMIN = "admin"
-    """All of the above."""
+OWN_TOKEN: Final = "owner"
+"""Name of the token in the data folder."""
 
 
 class TokenEntry(Contract):

@@ -133,9 +133,15 @@ class Authentication:
         if scope["type"] == "http" and scope["path"] not in OPEN_PATHS:
             header = next((value for key, value in scope["headers"] if key == b"authorization"), None)
             try:
-                scope["principal"] = self._tokens.authenticate(header.decode("latin-1") if header else None)
+                database = scope["app"].state.parts.database
+                scope["principal"] = await self._tokens.authenticate(
+                    header.decode("latin-1") if header else None, database
+                )
             except KilnError as error:
                 await problem_response(error.problem())(scope, receive, send)
+                return
+            except (psycopg.OperationalError, PoolTimeout) as error:
+                await (await _database_away(Request(scope), error))(scope, receive, send)
                 return
         await self._app(scope, receive, send)
 

@@ -13,7 +13,8 @@ from typing import Final
 
 from psycopg.types.json import Jsonb
 
-from kiln_schemas.errors import Conflict, InputError, KilnError, NotFound, Problem, StaleAttempt
+from kiln_schemas import __version__
+from kiln_schemas.errors import Conflict, Drained, InputError, KilnError, NotFound, Problem, StaleAttempt
 from kiln_schemas.states import LIVE_JOB_STATES, JobState, TaskState
 from kiln_schemas.tasks import (
     Checkpoint,
@@ -54,7 +55,13 @@ class Work:
         self._database, self._config, self._signals = database, config, signals
 
     async def register(self, registration: WorkerRegistration) -> str:
-        """A new worker's id."""
+        """A new worker's id; Conflict where it is of another version than this coordinator."""
+        if registration.version != __version__:
+            raise Conflict(
+                f"the worker is lightkiln {registration.version}, the coordinator {__version__}",
+                where="version",
+                remedy="Install the same version on both: what they tell each other changes between versions.",
+            )
         worker_id = new_id()
         async with self._database.transaction() as tx:
             await tx.run(
@@ -91,6 +98,10 @@ class Work:
     async def _claim_once(self, worker_id: str, kinds: Sequence[TaskKind]) -> "Claim | _Outcome":
         async with self._database.transaction() as tx:
             worker = await _seen(tx, worker_id)
+            if worker.orders == "drain":
+                raise Drained("an operator told the worker to leave", where=worker.name)
+            if worker.orders == "sleep":
+                return _NOTHING
             fetched = await queue.fetch(tx, kinds, worker.queue_worker)
             if fetched is None:
                 return _NOTHING

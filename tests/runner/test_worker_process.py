@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from kiln_schemas.errors import AuthError, InputError, MachineLacks
+from kiln_schemas.errors import AuthError, Drained, InputError, MachineLacks
 
 
 def children(pid: int) -> list[int]:
@@ -29,6 +29,13 @@ def test_sigterm_gives_the_task_back_and_leaves_no_child(
     (failure,) = coordinator.named("/fail")
     assert failure["attempt"] == 2 and failure["retryable"] and failure["problem"]["code"] == "canceled"
     assert not running(child)
+
+
+def test_a_drained_worker_leaves_by_itself(coordinator, stages_path, worker_program: list[str]) -> None:
+    """Told so when it asks for its next task: nothing has to be given back."""
+    coordinator.refuse["claim"] = Drained("an operator told the worker to leave")
+    done = subprocess.run(worker_program, timeout=60)
+    assert done.returncode == 0 and coordinator.named("/fail") == []
 
 
 def test_a_killed_worker_takes_its_child_along(coordinator, stages_path, worker_program: list[str], running) -> None:

@@ -17,6 +17,7 @@ import pytest
 import uvicorn
 from psycopg.rows import dict_row
 
+from kiln_schemas import __version__
 from kiln_service.app import create_app
 from kiln_service.config import Limits, ServiceConfig, Timing
 from kiln_service.embedded import EmbeddedPostgres
@@ -112,7 +113,7 @@ class FakeWorker:
             "memory_bytes": 2**30,
             "threads": 1,
             "device": "none",
-            "version": "0",
+            "version": __version__,
         }
         welcome = coordinator.client.post("/v1/workers", json=registration).raise_for_status().json()
         self.id = welcome["worker_id"]

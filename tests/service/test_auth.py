@@ -7,8 +7,9 @@ import stat
 import httpx
 import pytest
 
+from kiln_schemas.operators import Scope
 from kiln_service.auth import own_token
-from kiln_service.config import Scope, TokenEntry
+from kiln_service.config import TokenEntry
 
 OPEN = {"/healthz", "/readyz"}
 PLACEHOLDERS = {"sha256": "0" * 64}

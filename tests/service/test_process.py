@@ -14,10 +14,11 @@ from pathlib import Path
 import httpx
 import pytest
 
+from kiln_schemas import __version__
 from kiln_schemas.errors import MachineLacks
 from kiln_service.embedded import EmbeddedPostgres
 
-WORKER = {"name": "w", "kinds": ["prepare"], "memory_bytes": 1, "threads": 1, "device": "none", "version": "0"}
+WORKER = {"name": "w", "kinds": ["prepare"], "memory_bytes": 1, "threads": 1, "device": "none", "version": __version__}
 
 
 class Process:

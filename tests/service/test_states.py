@@ -19,7 +19,7 @@ from kiln_service.work import lock_task
 
 def moves(row, job):
     """Every move of a task by name, as a function of a transaction."""
-    worker = WorkerRow(id=row.worker_id or "", name="w", kinds=(), queue_worker=1)
+    worker = WorkerRow(id=row.worker_id or "", name="w", kinds=(), queue_worker=1, orders="work")
     problem = transitions.IllegalTransition("x").problem()
     return {
         "release": lambda tx: transitions.release_task(tx, job, row),

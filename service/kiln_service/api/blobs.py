@@ -6,9 +6,9 @@ from fastapi import APIRouter, Depends, Request, Response
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.job import MissingReply, MissingRequest
+from kiln_schemas.operators import Scope
 from kiln_service.api.common import PartsHere, Sha256Path, any_caller, problems
 from kiln_service.api.files import serve_blob
-from kiln_service.config import Scope
 
 router = APIRouter(prefix="/v1/blobs", tags=["blobs"])
 

@@ -8,9 +8,10 @@ from fastapi import Depends, Path, Request, Security
 from fastapi.security import HTTPBearer
 
 from kiln_schemas.errors import Problem
+from kiln_schemas.operators import Scope
 from kiln_service.auth import Principal
 from kiln_service.blobs import Blobs
-from kiln_service.config import Scope, ServiceConfig
+from kiln_service.config import ServiceConfig
 from kiln_service.db import Database
 from kiln_service.events import Signals
 from kiln_service.work import Work

@@ -7,13 +7,13 @@ from fastapi.responses import PlainTextResponse, StreamingResponse
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.job import EventView, JobChange, JobPage, JobRequest, JobView, TaskView, read_labels
+from kiln_schemas.operators import Scope
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
 from kiln_service import jobs, views
 from kiln_service.api.common import PartsHere, caller, problems
 from kiln_service.api.files import serve_blob
 from kiln_service.auth import Principal
-from kiln_service.config import Scope
 from kiln_service.events import BATCH, is_over, read_events, stream_events
 
 router = APIRouter(prefix="/v1", tags=["jobs"])

@@ -2,6 +2,7 @@
 
 from fastapi import APIRouter, Depends, Request, Response
 
+from kiln_schemas.operators import Scope
 from kiln_schemas.tasks import (
     Checkpoint,
     Claim,
@@ -14,12 +15,11 @@ from kiln_schemas.tasks import (
     WorkerWelcome,
 )
 from kiln_service.api.common import PartsHere, caller, problems
-from kiln_service.config import Scope
 
 router = APIRouter(prefix="/v1", tags=["workers"], dependencies=[Depends(caller(Scope.WORKER))])
 
 
-@router.post("/workers", status_code=201, responses=problems(422))
+@router.post("/workers", status_code=201, responses=problems(409, 422))
 async def register(registration: WorkerRegistration, parts: PartsHere) -> WorkerWelcome:
     """Register a worker; its id stays valid when the coordinator restarts."""
     worker_id = await parts.work.register(registration)
@@ -29,10 +29,10 @@ async def register(registration: WorkerRegistration, parts: PartsHere) -> Worker
 @router.post(
     "/workers/{worker_id}/claim",
     response_model=Claim,
-    responses=problems(404, 422) | {204: {"description": "Nothing to do within `wait_s`"}},
+    responses=problems(404, 409, 422) | {204: {"description": "Nothing to do within `wait_s`"}},
 )
 async def claim(worker_id: str, request: ClaimRequest, parts: PartsHere, http: Request) -> Claim | Response:
-    """Take the next task; held open up to `wait_s` while there is none."""
+    """Take the next task; held open up to `wait_s` while there is none. 409 `drained`: leave."""
     return await parts.work.claim(worker_id, request, http.is_disconnected) or Response(status_code=204)
 
 

@@ -18,6 +18,7 @@ from pydantic import TypeAdapter
 
 from kiln_schemas.errors import AuthError, Unreachable, error_of_answer
 from kiln_schemas.job import JobChange, JobPage, JobRequest, JobView, MissingReply, MissingRequest, TaskView
+from kiln_schemas.operators import NewToken, Order, TokenRequest, TokenView, WorkerView
 from kiln_schemas.states import JobState
 from kiln_schemas.tasks import Artifact, TaskKind
 
@@ -107,6 +108,27 @@ class Api:
         """Rank or label a job anew."""
         body = wanted.model_dump(mode="json", exclude_none=True)
         return JobView.model_validate_json(self._call("PATCH", f"/v1/jobs/{quote(job_id, safe='')}", json=body).content)
+
+    def workers(self) -> tuple[WorkerView, ...]:
+        """Workers that were seen within a week."""
+        return TypeAdapter(tuple[WorkerView, ...]).validate_json(self._call("GET", "/v1/workers").content)
+
+    def order_worker(self, worker_id: str, order: Order) -> None:
+        """Tell a worker to sleep, to wake or to leave."""
+        self._call("POST", f"/v1/workers/{quote(worker_id, safe='')}/orders/{order.value}")
+
+    def tokens(self) -> tuple[TokenView, ...]:
+        """Access tokens that were made, without themselves."""
+        return TypeAdapter(tuple[TokenView, ...]).validate_json(self._call("GET", "/v1/tokens").content)
+
+    def create_token(self, request: TokenRequest) -> NewToken:
+        """Make an access token."""
+        reply = self._call("POST", "/v1/tokens", json=request.model_dump(mode="json"))
+        return NewToken.model_validate_json(reply.content)
+
+    def revoke_token(self, name: str) -> None:
+        """Refuse a token from now on."""
+        self._call("DELETE", f"/v1/tokens/{quote(name, safe='')}")
 
     def task_log(self, task_id: str) -> str:
         """What the attempts of a task wrote."""

@@ -33,6 +33,7 @@ from kiln_service.cli.doctor import examine
 from kiln_service.cli.fetch import damaged_files, download_package
 from kiln_service.cli.gates import end_of, raise_if_missed, raise_unless_completed, write_junit
 from kiln_service.cli.jobs import add_job_commands
+from kiln_service.cli.operators import add_operator_commands
 from kiln_service.cli.output import (
     defect,
     duration,
@@ -388,6 +389,7 @@ def examples_write(
 
 
 add_job_commands(app)
+add_operator_commands(app)
 add_picture_commands(app)
 add_compare_command(app)
 

@@ -109,6 +109,8 @@ class WorkerRow(_Row):
     name: str
     kinds: tuple[str, ...]
     queue_worker: int
+    orders: str
+    """`work`, `sleep` or `drain`."""
 
     @classmethod
     def of(cls, row: DictRow) -> Self:

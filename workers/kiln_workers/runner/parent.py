@@ -20,6 +20,7 @@ from kiln_schemas import __version__
 from kiln_schemas.errors import (
     AuthError,
     Canceled,
+    Drained,
     Forbidden,
     InternalError,
     KilnError,
@@ -95,7 +96,10 @@ class Worker:
         self._failures = 0
 
     def run(self) -> None:
-        """Work until SIGTERM or SIGINT; the task at hand is then given back at once for another worker."""
+        """Work until SIGTERM or SIGINT, when the task at hand is given back at once for another worker.
+
+        Or until an operator drains the worker: it is told so when it asks for its next task.
+        """
         for sig in (signal.SIGTERM, signal.SIGINT):
             signal.signal(sig, self._interrupt)
         try:
@@ -103,6 +107,8 @@ class Worker:
                 self.step()
         except Interrupted:
             self._announce("worker.stopping", {})
+        except Drained as error:
+            self._announce("worker.drained", {"reason": error.detail})
         finally:
             self.close()
 

@@ -1,0 +1,103 @@
+"""What operators ask of a coordinator and what it tells them: workers, access tokens, the record of who did what."""
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from kiln_schemas.base import Contract
+from kiln_schemas.tasks import TaskKind
+
+
+class Scope(StrEnum):
+    """What a token allows; every route names the one it needs."""
+
+    READ = "read"
+    """Look at jobs, tasks, events, workers; download artifacts and blobs."""
+    SUBMIT = "submit"
+    """Upload blobs; submit, change, pause, cancel and retry jobs."""
+    WORKER = "worker"
+    """Claim tasks, upload and download their blobs, commit them."""
+    ADMIN = "admin"
+    """All of the above; tokens, orders to workers and the record."""
+
+
+class WorkerState(StrEnum):
+    """What a worker is doing."""
+
+    AWAKE = "awake"
+    """It asks for tasks; it has one where `task_id` is set."""
+    ASLEEP = "asleep"
+    """Told to take no task until it is woken."""
+    DRAINING = "draining"
+    """Told to leave once its task is done."""
+    OFFLINE = "offline"
+    """Not heard of for a minute."""
+
+
+class Order(StrEnum):
+    """What a worker may be told."""
+
+    WAKE = "wake"
+    """Take tasks again."""
+    SLEEP = "sleep"
+    """Finish the task at hand and take no other until it is woken."""
+    DRAIN = "drain"
+    """Finish the task at hand and leave: its process ends."""
+
+
+class WorkerView(Contract):
+    id: str
+    name: str
+    state: WorkerState
+    kinds: tuple[TaskKind, ...]
+    memory_bytes: int
+    threads: int
+    device: str
+    version: str
+    registered: datetime
+    seen: datetime
+    task_id: str | None = None
+    job_id: str | None = None
+    task: str | None = None
+    """Kind and label of the task at hand."""
+
+
+TokenName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+
+
+class TokenRequest(Contract):
+    """Body of `POST /v1/tokens`."""
+
+    name: TokenName
+    scopes: tuple[Scope, ...] = Field(min_length=1, max_length=4)
+
+
+class TokenView(Contract):
+    """A token as the coordinator knows it: never itself."""
+
+    name: str
+    scopes: tuple[Scope, ...]
+    created: datetime
+    created_by: str
+    used: datetime | None = None
+    """When it was last used, to the minute."""
+
+
+class NewToken(TokenView):
+    """Answer of `POST /v1/tokens`, the only time that the token is told."""
+
+    token: str
+
+
+class AuditEntry(Contract):
+    """One line of the record."""
+
+    id: int
+    at: datetime
+    actor: str
+    action: str
+    """`token.created`, `token.revoked`, `worker.drain`, ..."""
+    target: str
+    detail: dict[str, Any] = Field(default_factory=dict)

@@ -1,0 +1,75 @@
+"""Routes for operators: workers and their orders, access tokens, the record, metrics."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Query, Response
+
+from kiln_schemas.operators import (
+    AuditEntry,
+    NewToken,
+    Order,
+    Scope,
+    TokenRequest,
+    TokenView,
+    WorkerView,
+)
+from kiln_service import metrics, operators
+from kiln_service.api.common import PartsHere, caller, problems
+from kiln_service.auth import Principal
+
+router = APIRouter(prefix="/v1", tags=["operators"])
+
+Reader = Depends(caller(Scope.READ))
+Admin = Annotated[Principal, Depends(caller(Scope.ADMIN))]
+
+
+@router.get("/workers", dependencies=[Reader], responses=problems())
+async def workers(parts: PartsHere) -> tuple[WorkerView, ...]:
+    """Workers that were seen within a week, with the task that each has."""
+    return await operators.list_workers(parts.database)
+
+
+@router.post("/workers/{worker_id}/orders/{order}", status_code=204, responses=problems(404, 422))
+async def order(worker_id: str, order: Order, parts: PartsHere, who: Admin) -> None:
+    """Tell a worker to sleep, to wake, or to leave once its task is done."""
+    await operators.order_worker(parts.database, worker_id, order, who.actor)
+
+
+@router.get("/tokens", responses=problems())
+async def tokens(parts: PartsHere, _: Admin) -> tuple[TokenView, ...]:
+    """All tokens that were made here, without themselves."""
+    return await operators.list_tokens(parts.database)
+
+
+@router.post("/tokens", status_code=201, responses=problems(409, 422))
+async def create_token(request: TokenRequest, parts: PartsHere, who: Admin) -> NewToken:
+    """A new token. This answer alone tells it."""
+    return await operators.create_token(parts.database, parts.config, request, who.actor)
+
+
+@router.delete("/tokens/{name}", status_code=204, responses=problems(404))
+async def revoke_token(name: str, parts: PartsHere, who: Admin) -> None:
+    """Refuse a token from now on."""
+    await operators.revoke_token(parts.database, name, who.actor)
+
+
+@router.get("/audit", responses=problems(422))
+async def audit(
+    parts: PartsHere,
+    _: Admin,
+    before: Annotated[int | None, Query(ge=0, lt=2**63, description="only entries with smaller ids")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> tuple[AuditEntry, ...]:
+    """Who did what to tokens and workers, newest first. What was done to jobs is in their events."""
+    return await operators.list_audit(parts.database, before, limit)
+
+
+@router.get(
+    "/metrics",
+    dependencies=[Reader],
+    response_class=Response,
+    responses=problems() | {200: {"description": "In Prometheus' text format", "content": {"text/plain": {}}}},
+)
+async def prometheus(parts: PartsHere) -> Response:
+    """Queue, tasks, workers and storage for Prometheus."""
+    return Response(await metrics.text(parts.database), media_type=metrics.MEDIA_TYPE)

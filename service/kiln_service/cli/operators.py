@@ -1,0 +1,139 @@
+"""`lightkiln workers ...` and `lightkiln token ...`: what operators do."""
+
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from kiln_schemas.errors import InputError
+from kiln_schemas.operators import Order, Scope, TokenRequest, WorkerView
+from kiln_service.cli import options
+from kiln_service.cli.api import Api
+from kiln_service.cli.output import notices, print_json, results
+
+workers_app = typer.Typer(help="Workers of a farm.", no_args_is_help=True)
+token_app = typer.Typer(help="Access tokens of a coordinator.", no_args_is_help=True)
+
+Worker = Annotated[str, typer.Argument(metavar="WORKER", help="A worker's id or name.")]
+
+
+def add_operator_commands(app: typer.Typer) -> None:
+    """Add them to the command line."""
+    app.add_typer(workers_app, name="workers")
+    app.add_typer(token_app, name="token")
+
+
+@workers_app.command("list")
+def list_workers(
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Workers that were seen within a week."""
+    with options.connect(url, token, data) as api:
+        views = api.workers()
+    if json:
+        print_json([view.model_dump(mode="json") for view in views])
+        return
+    table = Table("worker", "name", "state", "task", "kinds", "threads", "device", "seen", box=None)
+    for view in views:
+        kinds = ",".join(view.kinds)
+        cells = (view.id, view.name, view.state.value, view.task or "", kinds, str(view.threads), view.device)
+        table.add_row(*map(escape, cells), f"{view.seen:%Y-%m-%d %H:%M:%S}")
+    results.print(table)
+
+
+def _order(order: Order):  # type: ignore[no-untyped-def]  # typer reads the parameters
+    def command(
+        worker: Worker,
+        url: options.Url = options.DEFAULT_URL,
+        token: options.Token = None,
+        data: options.Data = None,
+        json: options.Json = False,
+    ) -> None:
+        with options.connect(url, token, data) as api:
+            found = _named(api, worker)
+            for view in found:
+                api.order_worker(view.id, order)
+        if json:
+            print_json({"order": order.value, "workers": [view.id for view in found]})
+        else:
+            results.print("\n".join(f"{view.name} ({view.id}): {order.value}" for view in found), markup=False)
+
+    return command
+
+
+workers_app.command("drain", help="Let it finish its task and leave: its process ends.")(_order(Order.DRAIN))
+workers_app.command("sleep", help="Let it finish its task and take no other.")(_order(Order.SLEEP))
+workers_app.command("wake", help="Let it take tasks again.")(_order(Order.WAKE))
+
+
+def _named(api: Api, name: str) -> list[WorkerView]:
+    """The worker with this id, or those with this name that are not offline."""
+    views = api.workers()
+    found = [view for view in views if view.id == name] or [
+        view for view in views if view.name == name and view.state != "offline"
+    ]
+    if not found:
+        raise InputError(f"no worker '{name}' is there", where="WORKER", remedy="See `lightkiln workers list`.")
+    return found
+
+
+@token_app.command("create")
+def create_token(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Who uses it, as events name it.")],
+    scope: Annotated[list[Scope], typer.Option("--scope", help="What it allows; may be repeated.")],
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Make an access token and print it, this once."""
+    with options.connect(url, token, data) as api:
+        made = api.create_token(TokenRequest(name=name, scopes=tuple(scope)))
+    if json:
+        print_json(made)
+    else:
+        results.print(made.token, markup=False)
+        notices.print("Keep it: the coordinator knows its hash only.")
+
+
+@token_app.command("list")
+def list_tokens(
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Tokens that were made, without themselves."""
+    with options.connect(url, token, data) as api:
+        views = api.tokens()
+    if json:
+        print_json([view.model_dump(mode="json") for view in views])
+        return
+    table = Table("name", "scopes", "made", "by", "last used", box=None)
+    for view in views:
+        used = f"{view.used:%Y-%m-%d %H:%M}" if view.used else "never"
+        table.add_row(
+            escape(view.name), ", ".join(view.scopes), f"{view.created:%Y-%m-%d %H:%M}", view.created_by, used
+        )
+    results.print(table)
+
+
+@token_app.command("revoke")
+def revoke_token(
+    name: Annotated[str, typer.Argument(metavar="NAME")],
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Refuse a token from now on."""
+    with options.connect(url, token, data) as api:
+        api.revoke_token(name)
+    if json:
+        print_json({"revoked": name})
+    else:
+        results.print(f"{name}: revoked", markup=False)

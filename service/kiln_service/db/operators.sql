@@ -1,0 +1,72 @@
+-- Queries of kiln_service.operators and kiln_service.metrics.
+
+-- name: insert_token
+-- A new token; no row where the name is taken.
+INSERT INTO tokens (name, sha256, scopes, created_by)
+VALUES (%(name)s, %(sha256)s, %(scopes)s, %(actor)s)
+ON CONFLICT (name) DO NOTHING
+RETURNING *;
+
+-- name: list_tokens
+-- All tokens.
+SELECT * FROM tokens ORDER BY name;
+
+-- name: delete_token
+-- Revoke a token.
+DELETE FROM tokens WHERE name = %(name)s RETURNING name;
+
+-- name: find_token
+-- Whose token has this hash.
+SELECT name, scopes, COALESCE(used < now() - interval '1 minute', true) AS unnoticed FROM tokens
+WHERE sha256 = %(sha256)s;
+
+-- name: use_token
+-- Note that a token was used.
+UPDATE tokens SET used = now() WHERE sha256 = %(sha256)s;
+
+-- name: add_audit
+-- Record what was done.
+INSERT INTO audit (actor, action, target, detail) VALUES (%(actor)s, %(action)s, %(target)s, %(detail)s);
+
+-- name: list_audit
+-- The record, newest first.
+SELECT * FROM audit WHERE (%(before)s::bigint IS NULL OR id < %(before)s) ORDER BY id DESC LIMIT %(limit)s;
+
+-- name: list_workers
+-- Workers that were seen of late, with the task that each has.
+SELECT workers.*, workers.seen < now() - make_interval(secs => %(offline_s)s) AS offline,
+       tasks.id AS task_id, tasks.job_id, tasks.kind, tasks.label
+FROM workers
+LEFT JOIN LATERAL (
+    SELECT id, job_id, kind, label FROM tasks
+    WHERE tasks.worker_id = workers.id AND tasks.state = 'active' ORDER BY started DESC LIMIT 1
+) AS tasks ON true
+WHERE workers.seen > now() - make_interval(secs => %(forgotten_s)s)
+ORDER BY workers.name, workers.registered;
+
+-- name: order_worker
+-- Tell a worker what to do from its next claim on.
+UPDATE workers SET orders = %(orders)s WHERE id = %(id)s RETURNING id, name;
+
+-- name: count_tasks
+-- Tasks by kind and state.
+SELECT kind, state, count(*) AS tasks FROM tasks GROUP BY kind, state;
+
+-- name: count_jobs
+-- Jobs by state.
+SELECT state, count(*) AS jobs FROM jobs GROUP BY state;
+
+-- name: sum_seconds
+-- Busy seconds and number of completed attempts by kind.
+SELECT kind, count(*) AS tasks, COALESCE(sum((result ->> 'seconds')::float8), 0) AS seconds,
+       COALESCE(sum((result ->> 'paths')::float8), 0) AS paths,
+       COALESCE(sum((spec -> 'tile' ->> 'texels')::float8), 0) AS texels
+FROM tasks WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind;
+
+-- name: count_events
+-- Events of tasks by kind.
+SELECT kind, count(*) AS events FROM events WHERE kind = ANY(%(kinds)s) GROUP BY kind;
+
+-- name: sum_blobs
+-- Bytes of blobs.
+SELECT COALESCE(sum(size), 0)::bigint AS bytes, count(*) AS blobs FROM blobs;

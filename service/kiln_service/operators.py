@@ -1,0 +1,114 @@
+"""What operators do: access tokens, orders to workers, and the record of who did what."""
+
+import hashlib
+import secrets
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from psycopg.rows import DictRow
+from psycopg.types.json import Jsonb
+
+from kiln_schemas.errors import Conflict, NotFound
+from kiln_schemas.operators import (
+    AuditEntry,
+    NewToken,
+    Order,
+    Scope,
+    TokenRequest,
+    TokenView,
+    WorkerState,
+    WorkerView,
+)
+from kiln_service.config import OWN_TOKEN, ServiceConfig
+from kiln_service.db import Database, Tx
+
+OFFLINE_S: Final = 60.0
+FORGOTTEN_S: Final = 7 * 86400.0
+"""Workers not seen for so long are left out of lists."""
+
+_ORDERS: Final[Mapping[Order, str]] = {Order.WAKE: "work", Order.SLEEP: "sleep", Order.DRAIN: "drain"}
+
+
+async def create_token(database: Database, config: ServiceConfig, request: TokenRequest, actor: str) -> NewToken:
+    """A new token; told this once, kept as a hash. Conflict where the name is taken."""
+    token = secrets.token_urlsafe(32)
+    scopes = tuple(scope for scope in Scope if scope in request.scopes)
+    taken = request.name in {OWN_TOKEN, *(entry.name for entry in config.tokens)}
+    async with database.transaction() as tx:
+        row = (
+            None
+            if taken
+            else await tx.maybe(
+                "insert_token",
+                name=request.name,
+                sha256=hashlib.sha256(token.encode()).hexdigest(),
+                scopes=[scope.value for scope in scopes],
+                actor=actor,
+            )
+        )
+        if row is None:
+            raise Conflict(
+                f"there is a token '{request.name}'", where="name", remedy="Revoke it first, or choose another name."
+            )
+        await _record(tx, actor, "token.created", request.name, {"scopes": [scope.value for scope in scopes]})
+    return NewToken(**_token_view(row).model_dump(), token=token)
+
+
+async def list_tokens(database: Database) -> tuple[TokenView, ...]:
+    """All tokens that were made here."""
+    async with database.transaction() as tx:
+        return tuple(_token_view(row) for row in await tx.all("list_tokens"))
+
+
+async def revoke_token(database: Database, name: str, actor: str) -> None:
+    """Refuse a token from now on (`auth.MEMORY_S` at the latest); NotFound where there is none."""
+    async with database.transaction() as tx:
+        if await tx.maybe("delete_token", name=name) is None:
+            raise NotFound(
+                f"no token '{name}' was made here",
+                where="name",
+                remedy="Tokens of the configuration and of the data folder are removed there.",
+            )
+        await _record(tx, actor, "token.revoked", name)
+
+
+async def list_workers(database: Database) -> tuple[WorkerView, ...]:
+    """Workers that were seen within a week."""
+    async with database.transaction() as tx:
+        rows = await tx.all("list_workers", offline_s=OFFLINE_S, forgotten_s=FORGOTTEN_S)
+    return tuple(_worker_view(row) for row in rows)
+
+
+async def order_worker(database: Database, worker_id: str, order: Order, actor: str) -> None:
+    """Tell a worker what to do once it has no task; NotFound where there is none."""
+    async with database.transaction() as tx:
+        row = await tx.maybe("order_worker", id=worker_id, orders=_ORDERS[order])
+        if row is None:
+            raise NotFound(f"no worker '{worker_id}'", where="worker", remedy="GET /v1/workers lists them.")
+        await _record(tx, actor, f"worker.{order.value}", row["name"], {"worker": worker_id})
+
+
+async def list_audit(database: Database, before: int | None, limit: int) -> tuple[AuditEntry, ...]:
+    """The record, newest first."""
+    async with database.transaction() as tx:
+        return tuple(AuditEntry.model_validate(row) for row in await tx.all("list_audit", before=before, limit=limit))
+
+
+async def _record(tx: Tx, actor: str, action: str, target: str, detail: Mapping[str, Any] | None = None) -> None:
+    await tx.run("add_audit", actor=actor, action=action, target=target, detail=Jsonb(dict(detail or {})))
+
+
+def _token_view(row: DictRow) -> TokenView:
+    return TokenView.model_validate({name: row[name] for name in TokenView.model_fields})
+
+
+def _worker_view(row: DictRow) -> WorkerView:
+    names: Sequence[str] = [name for name in WorkerView.model_fields if name not in ("state", "task")]
+    task = None if row["task_id"] is None else f"{row['kind']} {row['label']}"
+    return WorkerView.model_validate({name: row[name] for name in names} | {"state": _state(row), "task": task})
+
+
+def _state(row: DictRow) -> WorkerState:
+    if row["offline"]:
+        return WorkerState.OFFLINE
+    return {"sleep": WorkerState.ASLEEP, "drain": WorkerState.DRAINING}.get(row["orders"], WorkerState.AWAKE)
