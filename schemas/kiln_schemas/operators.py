@@ -91,6 +91,31 @@ class NewToken(TokenView):
     token: str
 
 
+class GcRequest(Contract):
+    """Body of `POST /v1/gc`."""
+
+    days: float = Field(default=0.0, ge=0, le=36500, description="only jobs that ended so long ago or earlier")
+    dry_run: bool = Field(default=False, description="only say what would go")
+
+
+class Freed(Contract):
+    """What one archived job left behind."""
+
+    job_id: str
+    name: str
+    stores: tuple[str, ...]
+    """Light-field stores that are gone."""
+    blob_bytes: int
+    """Of blobs that nobody else uses; they go with the next collection."""
+
+
+class GcReport(Contract):
+    """Answer of `POST /v1/gc`."""
+
+    dry_run: bool
+    jobs: tuple[Freed, ...]
+
+
 class AuditEntry(Contract):
     """One line of the record."""
 

@@ -31,6 +31,15 @@ WRITE_BYTES: Final = 2**20
 READ_BYTES: Final = 2**20
 
 
+def open_objects(url: str) -> ObjectStore:
+    """The objects under a `file://` or `s3://` URL; an S3 server in `AWS_ENDPOINT_URL` may speak plain HTTP."""
+    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
+    if url.startswith("s3://") and endpoint:
+        plain = endpoint.startswith("http://")
+        return from_url(url, config={"endpoint": endpoint}, client_options={"allow_http": plain})
+    return from_url(url)
+
+
 class Blobs:
     """The blobs of one coordinator."""
 
@@ -41,7 +50,7 @@ class Blobs:
         self._folder = _local_folder(url)
         for folder in filter(None, (self._incoming, self._folder)):
             folder.mkdir(parents=True, exist_ok=True)
-        self._objects: ObjectStore = from_url(url)
+        self._objects: ObjectStore = open_objects(url)
 
     async def receive(self, sha256: str, body: AsyncIterator[bytes], length: int | None) -> int:
         """Take an upload whole or not at all; its size in bytes. `length` is the announced Content-Length."""

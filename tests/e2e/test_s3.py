@@ -1,10 +1,14 @@
 """A farm whose light-field store is in a bucket: the package is the one that a bake on one machine makes."""
 
+import json
 from pathlib import Path
 
+import obstore
 import pytest
 import seaweed
-from e2e_farm import Farm, digests, settings
+from e2e_farm import Farm, digests, lightkiln, settings
+
+from kiln_service.blobs import open_objects
 
 
 def test_a_store_in_a_bucket(
@@ -25,7 +29,14 @@ def test_a_store_in_a_bucket(
         job = farm.submit(*room_files, *settings())
         farm.finish(job)
         package = farm.download(job, folder / "package")
+        at = ("--url", farm.url, "--token", farm.token)
+        assert lightkiln("archive", job, *at).returncode == 0
+        freed = json.loads(lightkiln("gc", *at, "--json").stdout)
+        again = json.loads(lightkiln("gc", *at, "--json").stdout)
     finally:
         farm.stop()
     assert digests(package) == digests(baked)
     assert not (farm.folder / "data" / "store").exists()
+    assert freed["jobs"][0]["stores"] == [f"s3://{s3_server.bucket}/light-fields/{job}.zarr"] and again["jobs"] == []
+    bucket = open_objects(f"s3://{s3_server.bucket}/light-fields")
+    assert [entry["path"] for page in obstore.list(bucket) for entry in page] == []

@@ -6,6 +6,8 @@ from fastapi import APIRouter, Depends, Query, Response
 
 from kiln_schemas.operators import (
     AuditEntry,
+    GcReport,
+    GcRequest,
     NewToken,
     Order,
     Scope,
@@ -13,7 +15,7 @@ from kiln_schemas.operators import (
     TokenView,
     WorkerView,
 )
-from kiln_service import metrics, operators
+from kiln_service import gc, metrics, operators
 from kiln_service.api.common import PartsHere, caller, problems
 from kiln_service.auth import Principal
 
@@ -62,6 +64,13 @@ async def audit(
 ) -> tuple[AuditEntry, ...]:
     """Who did what to tokens and workers, newest first. What was done to jobs is in their events."""
     return await operators.list_audit(parts.database, before, limit)
+
+
+@router.post("/gc", responses=problems(422))
+async def collect_garbage(request: GcRequest, parts: PartsHere, who: Admin) -> GcReport:
+    """Free what archived jobs have besides their packages: light-field stores that no other job reads, and blobs."""
+    days, dry = request.days, request.dry_run
+    return await gc.free_archived(parts.database, parts.config, days, dry_run=dry, actor=who.actor)
 
 
 @router.get(

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from kiln_schemas.errors import AuthError, Unreachable, error_of_answer
 from kiln_schemas.job import JobChange, JobPage, JobRequest, JobView, MissingReply, MissingRequest, TaskView
-from kiln_schemas.operators import NewToken, Order, TokenRequest, TokenView, WorkerView
+from kiln_schemas.operators import GcReport, GcRequest, NewToken, Order, TokenRequest, TokenView, WorkerView
 from kiln_schemas.states import JobState
 from kiln_schemas.tasks import Artifact, TaskKind
 
@@ -129,6 +129,11 @@ class Api:
     def revoke_token(self, name: str) -> None:
         """Refuse a token from now on."""
         self._call("DELETE", f"/v1/tokens/{quote(name, safe='')}")
+
+    def collect_garbage(self, request: GcRequest) -> GcReport:
+        """Free what archived jobs left behind."""
+        reply = self._call("POST", "/v1/gc", json=request.model_dump(mode="json"))
+        return GcReport.model_validate_json(reply.content)
 
     def task_log(self, task_id: str) -> str:
         """What the attempts of a task wrote."""

@@ -7,7 +7,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from kiln_schemas.errors import InputError
-from kiln_schemas.operators import Order, Scope, TokenRequest, WorkerView
+from kiln_schemas.operators import GcRequest, Order, Scope, TokenRequest, WorkerView
 from kiln_service.cli import options
 from kiln_service.cli.api import Api
 from kiln_service.cli.output import notices, print_json, results
@@ -22,6 +22,28 @@ def add_operator_commands(app: typer.Typer) -> None:
     """Add them to the command line."""
     app.add_typer(workers_app, name="workers")
     app.add_typer(token_app, name="token")
+    app.command("gc")(collect_garbage)
+
+
+def collect_garbage(
+    days: Annotated[float, typer.Option("--older-than", min=0, metavar="DAYS", help="Since the job ended.")] = 0.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would go.")] = False,
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Free what archived jobs have besides their packages: light fields and the data between tasks."""
+    with options.connect(url, token, data) as api:
+        report = api.collect_garbage(GcRequest(days=days, dry_run=dry_run))
+    if json:
+        print_json(report)
+        return
+    for job in report.jobs:
+        blobs = f"{job.blob_bytes / 2**20:.1f} MiB of blobs"
+        results.print(f"{job.name} ({job.job_id}): {', '.join((*job.stores, blobs))}", markup=False, soft_wrap=True)
+    verb = "would be freed" if dry_run else "freed"
+    results.print(f"{len(report.jobs)} archived jobs {verb}.", markup=False)
 
 
 @workers_app.command("list")

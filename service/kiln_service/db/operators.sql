@@ -70,3 +70,33 @@ SELECT kind, count(*) AS events FROM events WHERE kind = ANY(%(kinds)s) GROUP BY
 -- name: sum_blobs
 -- Bytes of blobs.
 SELECT COALESCE(sum(size), 0)::bigint AS bytes, count(*) AS blobs FROM blobs;
+
+-- name: find_freeable
+-- Archived jobs that ended before `days` ago and whose data is still there, oldest first.
+SELECT id FROM jobs
+WHERE state = 'archived' AND freed IS NULL AND finished < now() - make_interval(secs => %(days)s * 86400.0)
+ORDER BY id;
+
+-- name: stores_needed_by_others
+-- Which of these stores jobs read that are not freed; the job itself apart.
+SELECT DISTINCT store_url FROM jobs
+WHERE store_url = ANY(%(stores)s) AND id <> %(id)s AND freed IS NULL;
+
+-- name: drop_data_uses
+-- An archived job needs none of its blobs but those of its package; bytes that nobody else uses.
+WITH dropped AS (
+    DELETE FROM blob_uses
+    WHERE owner = 'job:' || %(id)s::text
+       OR owner IN (SELECT 'result:' || id FROM tasks WHERE job_id = %(id)s AND kind <> 'package')
+    RETURNING sha256, owner
+)
+SELECT COALESCE(sum(size), 0)::bigint AS bytes FROM blobs
+WHERE sha256 IN (SELECT sha256 FROM dropped)
+  AND NOT EXISTS (
+      SELECT FROM blob_uses WHERE blob_uses.sha256 = blobs.sha256
+        AND blob_uses.owner NOT IN (SELECT owner FROM dropped)
+  );
+
+-- name: set_freed
+-- The job's data is gone.
+UPDATE jobs SET freed = now() WHERE id = %(id)s;

@@ -139,16 +139,18 @@ SELECT * FROM jobs WHERE submitter = %(submitter)s AND idempotency_key = %(key)s
 UPDATE jobs SET render_key = %(key)s WHERE id = %(id)s;
 
 -- name: find_renders
--- The newest other job whose light fields are the same and all there, and that has what the descent learns from.
+-- The newest other job whose light fields are the same and all there, and that has what the descent learns from; it is
+-- not archived before this transaction ends.
 SELECT jobs.id, jobs.store_url FROM jobs
 JOIN tasks AS prepared ON prepared.job_id = jobs.id AND prepared.kind = 'prepare' AND prepared.state = 'completed'
-WHERE jobs.render_key = %(key)s AND jobs.id <> %(id)s AND jobs.method = %(method)s
+WHERE jobs.render_key = %(key)s AND jobs.id <> %(id)s AND jobs.method = %(method)s AND jobs.state <> 'archived'
   AND (%(between)s::jsonb = '[]' OR COALESCE(prepared.result -> 'between', '[]') = %(between)s)
   AND NOT EXISTS (
       SELECT FROM tasks WHERE tasks.job_id = jobs.id AND tasks.kind = 'render' AND tasks.state <> 'completed'
   )
 ORDER BY jobs.id DESC
-LIMIT 1;
+LIMIT 1
+FOR SHARE OF jobs SKIP LOCKED;
 
 -- name: share_renders
 -- Read the light fields of another job from now on.

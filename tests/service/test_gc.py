@@ -1,0 +1,96 @@
+"""What archived jobs leave behind is freed, and nothing that any other job needs."""
+
+from pathlib import Path
+from urllib.parse import urlparse
+
+import pytest
+
+
+def baked(home, **changes):
+    """A completed job with a store on the disk."""
+    job, worker = home.submit(**changes), home.worker()
+    while (claim := worker.claim()) is not None:
+        if claim["payload"]["kind"] == "prepare":
+            store = Path(urlparse(claim["payload"]["store_url"]).path)
+            store.mkdir(parents=True)
+            (store / "zarr.json").write_text("{}")
+        worker.finish(claim)
+    assert home.job(job["id"])["state"] == "completed"
+    return job["id"]
+
+
+def store_of(home, job_id):
+    (row,) = home.sql("SELECT store_url FROM jobs WHERE id = %s", job_id)
+    return Path(urlparse(row["store_url"]).path)
+
+
+def archive(home, job_id):
+    home.client.post(f"/v1/jobs/{job_id}/archive").raise_for_status()
+
+
+def gc(home, **body):
+    return home.client.post("/v1/gc", json=body).raise_for_status().json()
+
+
+def test_only_archived_jobs_are_freed_and_their_packages_stay(home):
+    kept, gone = baked(home, set=["render.samples=8"]), baked(home, set=["render.samples=9"])
+    archive(home, gone)
+    assert [job["job_id"] for job in gc(home, dry_run=True)["jobs"]] == [gone]
+    assert store_of(home, gone).exists(), "that was a dry run"
+    report = gc(home)
+    (freed,) = report["jobs"]
+    assert freed["job_id"] == gone and len(freed["stores"]) == 1 and not report["dry_run"]
+    assert not store_of(home, gone).exists() and store_of(home, kept).exists()
+    assert gc(home)["jobs"] == [], "it is done once"
+    owners = {row["owner"].partition(":")[0] for row in home.sql("SELECT owner FROM blob_uses")}
+    assert owners == {"job", "result"}
+    (name,) = [a["name"] for a in home.client.get(f"/v1/jobs/{gone}/artifacts").json() if a["name"].endswith("ktx2")]
+    assert home.client.get(f"/v1/jobs/{gone}/artifacts/{name}").status_code == 200
+    assert home.client.get("/v1/audit").json()[0]["action"] == "gc"
+
+
+def test_a_shared_store_stays_until_its_last_reader_is_archived(home):
+    first = baked(home)
+    second = baked(home, set=["fit.lobes=4"])
+    assert home.job(second)["renders_of"] == first
+    shared = store_of(home, first)
+    assert store_of(home, second) == shared
+    archive(home, first)
+    (freed,) = gc(home)["jobs"]
+    assert freed["stores"] == [] and shared.exists()
+    archive(home, second)
+    (freed,) = gc(home)["jobs"]
+    assert not shared.exists() and len(freed["stores"]) == 2, "its own empty one and the shared one"
+    assert list(shared.parent.iterdir()) == []
+
+
+def test_light_fields_of_an_archived_job_are_not_shared(home):
+    archive(home, baked(home))
+    home.submit(set=["fit.lobes=4"])
+    worker = home.worker()
+    worker.finish(worker.must_claim("prepare"))
+    assert worker.must_claim()["payload"]["kind"] == "render"
+
+
+def test_younger_jobs_are_kept(home):
+    job = baked(home)
+    archive(home, job)
+    assert gc(home, days=1)["jobs"] == []
+    home.sql("UPDATE jobs SET finished = now() - interval '25 hours'")
+    assert [one["job_id"] for one in gc(home, days=1)["jobs"]] == [job]
+
+
+def test_a_store_elsewhere_is_left_alone(home, tmp_path):
+    """A store outside of the coordinator's own folder is not for it to delete, whatever a row says."""
+    job = baked(home)
+    precious = tmp_path / "precious.zarr"
+    precious.mkdir()
+    home.sql("UPDATE jobs SET store_url = %s", precious.as_uri())
+    archive(home, job)
+    gc(home)
+    assert precious.exists()
+
+
+@pytest.mark.parametrize("body", [{"days": -1}, {"days": "x"}, {"dry_run": 3}, {"more": 1}])
+def test_wrong_requests_are_refused(shared, body):
+    assert shared.client.post("/v1/gc", json=body).status_code == 422
