@@ -91,6 +91,60 @@ class NewToken(TokenView):
     token: str
 
 
+class JobEvent(StrEnum):
+    """What a webhook may be told of."""
+
+    CREATED = "job.created"
+    ACTIVE = "job.active"
+    PAUSED = "job.paused"
+    COMPLETED = "job.completed"
+    GATE_FAILED = "job.gate-failed"
+    FAILED = "job.failed"
+    CANCELED = "job.canceled"
+
+
+class WebhookRequest(Contract):
+    """Body of `POST /v1/webhooks`."""
+
+    url: Annotated[str, Field(pattern=r"^https?://[^\s/@]+(/[^\s]*)?$", max_length=2048)]
+    events: tuple[JobEvent, ...] = Field(
+        default=(JobEvent.COMPLETED, JobEvent.GATE_FAILED, JobEvent.FAILED, JobEvent.CANCELED),
+        min_length=1,
+        max_length=7,
+    )
+
+
+class WebhookView(Contract):
+    id: str
+    url: str
+    events: tuple[JobEvent, ...]
+    created: datetime
+    created_by: str
+
+
+class NewWebhook(WebhookView):
+    """Answer of `POST /v1/webhooks`, the only time that the secret is told."""
+
+    secret: str
+
+
+class DeliveryView(Contract):
+    """What became of one telling."""
+
+    id: int
+    event: str
+    job_id: str
+    outcome: str
+    """`pending`, `delivered` or `failed` (after twelve attempts)."""
+    attempts: int
+    status: int | None
+    """Of the receiver's last answer."""
+    error: str | None
+    """Why there was no answer."""
+    due: datetime
+    ended: datetime | None
+
+
 class GcRequest(Contract):
     """Body of `POST /v1/gc`."""
 

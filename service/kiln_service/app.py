@@ -29,6 +29,7 @@ from kiln_service.db import Database
 from kiln_service.db.migrate import migrate
 from kiln_service.events import Signals
 from kiln_service.maintenance import Maintenance
+from kiln_service.webhooks import Deliverer
 from kiln_service.work import Work
 
 
@@ -85,6 +86,7 @@ async def _lifespan(app: FastAPI, config: ServiceConfig) -> AsyncIterator[None]:
         app.state.parts = Parts(config, database, blobs, signals, work)
         background = [
             asyncio.create_task(signals.listen(), name="signals"),
+            asyncio.create_task(Deliverer(database, config.timing).run(), name="webhooks"),
             asyncio.create_task(Maintenance(database, config, work, blobs).run(), name="maintenance"),
         ]
         try:

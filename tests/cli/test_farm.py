@@ -12,8 +12,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from kiln_schemas.client import Client
 from kiln_schemas.errors import AuthError, InternalError
-from kiln_service.cli.api import Api
 from kiln_service.cli.farm import RESTARTS, Managed, share
 
 
@@ -36,7 +36,7 @@ def managed(tmp_path: Path, code: str) -> Managed:
 
 
 def test_a_coordinator_killed_with_9_comes_back_with_its_jobs(coordinator) -> None:
-    with Api(coordinator.url, coordinator.farm.token, patience_s=60) as api:
+    with Client(coordinator.url, coordinator.farm.token, patience_s=60) as api:
         before = api.jobs()
         pid = coordinator.farm.coordinator.pid
         assert pid is not None
@@ -49,7 +49,7 @@ def test_a_coordinator_killed_with_9_comes_back_with_its_jobs(coordinator) -> No
 
 
 def test_a_killed_database_comes_back_with_its_coordinator_and_their_jobs(coordinator) -> None:
-    with Api(coordinator.url, coordinator.farm.token, patience_s=60) as api:
+    with Client(coordinator.url, coordinator.farm.token, patience_s=60) as api:
         before = api.jobs()
         pid = coordinator.farm.coordinator.pid
         assert pid is not None

@@ -6,16 +6,20 @@ from fastapi import APIRouter, Depends, Query, Response
 
 from kiln_schemas.operators import (
     AuditEntry,
+    DeliveryView,
     GcReport,
     GcRequest,
     NewToken,
+    NewWebhook,
     Order,
     Scope,
     TokenRequest,
     TokenView,
+    WebhookRequest,
+    WebhookView,
     WorkerView,
 )
-from kiln_service import gc, metrics, operators
+from kiln_service import gc, metrics, operators, webhooks
 from kiln_service.api.common import PartsHere, caller, problems
 from kiln_service.auth import Principal
 
@@ -64,6 +68,32 @@ async def audit(
 ) -> tuple[AuditEntry, ...]:
     """Who did what to tokens and workers, newest first. What was done to jobs is in their events."""
     return await operators.list_audit(parts.database, before, limit)
+
+
+@router.get("/webhooks", responses=problems())
+async def list_webhooks(parts: PartsHere, _: Admin) -> tuple[WebhookView, ...]:
+    """All webhooks, without their secrets."""
+    return await webhooks.list_webhooks(parts.database)
+
+
+@router.post("/webhooks", status_code=201, responses=problems(422))
+async def add_webhook(request: WebhookRequest, parts: PartsHere, who: Admin) -> NewWebhook:
+    """Tell a URL of jobs' events from now on. This answer alone tells the secret that signs them."""
+    return await webhooks.add_webhook(parts.database, request, who.actor)
+
+
+@router.delete("/webhooks/{webhook_id}", status_code=204, responses=problems(404))
+async def remove_webhook(webhook_id: str, parts: PartsHere, who: Admin) -> None:
+    """Tell it nothing more."""
+    await webhooks.remove_webhook(parts.database, webhook_id, who.actor)
+
+
+@router.get("/webhooks/{webhook_id}/deliveries", responses=problems(422))
+async def deliveries(
+    webhook_id: str, parts: PartsHere, _: Admin, limit: Annotated[int, Query(ge=1, le=1000)] = 100
+) -> tuple[DeliveryView, ...]:
+    """What became of each telling, newest first."""
+    return await webhooks.list_deliveries(parts.database, webhook_id, limit)
 
 
 @router.post("/gc", responses=problems(422))

@@ -19,6 +19,7 @@ from pydantic import ValidationError
 
 from kiln_schemas.base import Contract
 from kiln_schemas.camera import Camera
+from kiln_schemas.client import Client
 from kiln_schemas.conventions import MANIFEST_JSON
 from kiln_schemas.errors import (
     Conflict,
@@ -35,7 +36,6 @@ from kiln_schemas.job import JobRequest, JobView, TaskView
 from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import make_settings
 from kiln_schemas.states import PUBLISHED_JOB_STATES, JobState
-from kiln_service.cli.api import Api
 from kiln_service.cli.bundle import LocalBundle, collect
 from kiln_service.cli.farm import LocalFarm, share
 from kiln_service.cli.fetch import download_package, remove_package, writing
@@ -143,7 +143,7 @@ def _run(
     count, threads, memory = share(options.workers)
     with LocalFarm(data, workers=count, threads=threads, memory=memory, say=display.say) as farm:
         farm.start()
-        with Api(farm.url, farm.token, patience_s=2.0) as api:
+        with Client(farm.url, farm.token, patience_s=2.0) as api:
             job_id = _steadily(farm, lambda: _unfinished_job(api, display))
             if job_id is None:
                 job_id = _steadily(farm, lambda: upload_and_submit(api, local, request, bar=False)).id
@@ -167,7 +167,7 @@ def _steadily(farm: LocalFarm, call: Callable[[], T]) -> T:
             farm.revive()
 
 
-def _unfinished_job(api: Api, display: Display) -> str | None:
+def _unfinished_job(api: Client, display: Display) -> str | None:
     """The job of an earlier call, noted or not, which this one can go on with; the data folder holds one bake.
 
     A job that failed stays failed, but what it lacked may be there now: then None, for a new job.

@@ -11,12 +11,12 @@ from typing import Annotated, Final
 import typer
 from pydantic import ValidationError
 
+from kiln_schemas.client import Client
 from kiln_schemas.conventions import MANIFEST_JSON
 from kiln_schemas.errors import InputError, NotFound
 from kiln_schemas.job import JobView
 from kiln_schemas.manifest import Manifest
 from kiln_service.cli import options
-from kiln_service.cli.api import Api
 from kiln_service.cli.become import become
 from kiln_service.cli.fetch import download_package, writing
 from kiln_service.cli.gates import raise_unless_completed
@@ -101,7 +101,7 @@ def _store(job: str, data: Path | None) -> str:
     return place.as_uri()
 
 
-def _fetch(api: Api, job: JobView, out: Path, env: Path | None) -> tuple[Path, Path | None]:
+def _fetch(api: Client, job: JobView, out: Path, env: Path | None) -> tuple[Path, Path | None]:
     """The job's package and its environment's file, downloaded into `out` where they are not there yet."""
     folder = out / PACKAGE
     if not _is_package_of(folder, job.id):
@@ -109,7 +109,7 @@ def _fetch(api: Api, job: JobView, out: Path, env: Path | None) -> tuple[Path, P
     return folder, env or _environment(api, job, out)
 
 
-def _environment(api: Api, job: JobView, out: Path) -> Path | None:
+def _environment(api: Client, job: JobView, out: Path) -> Path | None:
     """The environment that the job was given, if there is one."""
     wanted = job.bundle.environment
     if wanted is None:

@@ -21,6 +21,7 @@ from typing import Final, Self
 
 from pydantic import ValidationError
 
+from kiln_schemas.client import Client
 from kiln_schemas.errors import (
     AuthError,
     InputError,
@@ -29,7 +30,6 @@ from kiln_schemas.errors import (
     MachineLacks,
     Problem,
 )
-from kiln_service.cli.api import Api
 
 HOST: Final = "127.0.0.1"
 READY_TIMEOUT_S: Final = 180.0
@@ -168,7 +168,7 @@ class LocalFarm:
         """Start the coordinator, wait until it is ready, start the workers."""
         self.coordinator.start()
         deadline = time.monotonic() + READY_TIMEOUT_S
-        with Api(self.url, None, patience_s=0) as api:
+        with Client(self.url, None, patience_s=0) as api:
             while not api.ready():
                 if time.monotonic() > deadline:
                     raise MachineLacks(

@@ -12,16 +12,16 @@ from pathlib import Path
 
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 
+from kiln_schemas.client import Client
 from kiln_schemas.conventions import MANIFEST_JSON
 from kiln_schemas.errors import DISK_FULL, Conflict, InputError, MachineLacks
 from kiln_schemas.job import check_bundle_path
 from kiln_schemas.tasks import Artifact
-from kiln_service.cli.api import Api
 from kiln_service.cli.bundle import sha256_of
 from kiln_service.cli.output import notices
 
 
-def download_package(api: Api, job_id: str, out: Path, *, force: bool = False, bar: bool = True) -> list[Path]:
+def download_package(api: Client, job_id: str, out: Path, *, force: bool = False, bar: bool = True) -> list[Path]:
     """Put the job's artifacts into `out`; the files, the manifest last."""
     if (out / MANIFEST_JSON).exists() and not force:
         raise Conflict("there is a package already", where=str(out), remedy="Pass --force to replace it.")
@@ -91,7 +91,7 @@ def writing(where: Path) -> Iterator[None]:
         ) from None
 
 
-def _fetch(api: Api, job_id: str, artifacts: Sequence[Artifact], partial: Path, bar: bool) -> None:
+def _fetch(api: Client, job_id: str, artifacts: Sequence[Artifact], partial: Path, bar: bool) -> None:
     """Download what an interrupted download has not left in `partial`."""
     columns = (TextColumn("downloading"), BarColumn(), DownloadColumn())
     with Progress(*columns, console=notices, transient=True, disable=not (bar and notices.is_terminal)) as shown:

@@ -1,19 +1,22 @@
 """`lightkiln workers ...` and `lightkiln token ...`: what operators do."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from pydantic import ValidationError
 from rich.markup import escape
 from rich.table import Table
 
+from kiln_schemas.client import Client
 from kiln_schemas.errors import InputError
-from kiln_schemas.operators import GcRequest, Order, Scope, TokenRequest, WorkerView
+from kiln_schemas.operators import GcRequest, JobEvent, Order, Scope, TokenRequest, WebhookRequest, WorkerView
 from kiln_service.cli import options
-from kiln_service.cli.api import Api
 from kiln_service.cli.output import notices, print_json, results
 
 workers_app = typer.Typer(help="Workers of a farm.", no_args_is_help=True)
 token_app = typer.Typer(help="Access tokens of a coordinator.", no_args_is_help=True)
+
+webhook_app = typer.Typer(help="Programs that are told of jobs.", no_args_is_help=True)
 
 Worker = Annotated[str, typer.Argument(metavar="WORKER", help="A worker's id or name.")]
 
@@ -22,6 +25,7 @@ def add_operator_commands(app: typer.Typer) -> None:
     """Add them to the command line."""
     app.add_typer(workers_app, name="workers")
     app.add_typer(token_app, name="token")
+    app.add_typer(webhook_app, name="webhook")
     app.command("gc")(collect_garbage)
 
 
@@ -92,7 +96,7 @@ workers_app.command("sleep", help="Let it finish its task and take no other.")(_
 workers_app.command("wake", help="Let it take tasks again.")(_order(Order.WAKE))
 
 
-def _named(api: Api, name: str) -> list[WorkerView]:
+def _named(api: Client, name: str) -> list[WorkerView]:
     """The worker with this id, or those with this name that are not offline."""
     views = api.workers()
     found = [view for view in views if view.id == name] or [
@@ -159,3 +163,70 @@ def revoke_token(
         print_json({"revoked": name})
     else:
         results.print(f"{name}: revoked", markup=False)
+
+
+@webhook_app.command("add")
+def add_webhook(
+    target: Annotated[str, typer.Argument(metavar="TARGET", help="The http:// or https:// URL to tell.")],
+    event: Annotated[
+        list[JobEvent] | None, typer.Option("--event", help="May be repeated; by default however a job ends.")
+    ] = None,
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Tell a URL of jobs, and print the secret that signs what is sent, this once."""
+    wanted: dict[str, Any] = {"url": target} | ({"events": tuple(event)} if event else {})
+    try:
+        request = WebhookRequest.model_validate(wanted)
+    except ValidationError:
+        raise InputError(
+            f"'{target}' is not a URL to tell", where="TARGET", remedy="Write https://HOST/PATH."
+        ) from None
+    with options.connect(url, token, data) as api:
+        made = api.add_webhook(request)
+    if json:
+        print_json(made)
+    else:
+        results.print(f"{made.id}\n{made.secret}", markup=False)
+        notices.print("The second line is the secret: keep it, it is not told again.")
+
+
+@webhook_app.command("list")
+def list_webhooks(
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Who is told of what, and how the last telling went."""
+    with options.connect(url, token, data) as api:
+        views = api.webhooks()
+        last = {view.id: next(iter(api.deliveries(view.id)), None) for view in views}
+    if json:
+        print_json([view.model_dump(mode="json") for view in views])
+        return
+    table = Table("webhook", "url", "events", "last", box=None)
+    for view in views:
+        told = last[view.id]
+        words = f"{told.event}: {told.outcome} {told.error or told.status or ''}" if told else ""
+        table.add_row(view.id, escape(view.url), ", ".join(view.events), escape(words))
+    results.print(table)
+
+
+@webhook_app.command("remove")
+def remove_webhook(
+    webhook: Annotated[str, typer.Argument(metavar="WEBHOOK", help="Its id.")],
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Tell it nothing more."""
+    with options.connect(url, token, data) as api:
+        api.remove_webhook(webhook)
+    if json:
+        print_json({"removed": webhook})
+    else:
+        results.print(f"{webhook}: removed", markup=False)

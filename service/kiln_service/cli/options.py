@@ -6,8 +6,8 @@ from typing import Annotated, Final
 
 import typer
 
+from kiln_schemas.client import Client
 from kiln_schemas.errors import AuthError
-from kiln_service.cli.api import Api
 
 DEFAULT_URL: Final = "http://127.0.0.1:8321"
 TOKEN_FILE: Final = "token"
@@ -65,9 +65,9 @@ EnvironmentRotation = Annotated[
 ]
 
 
-def connect(url: str, token: str | None, data: Path | None, *, patience_s: float = 5.0) -> Api:
+def connect(url: str, token: str | None, data: Path | None, *, patience_s: float = 5.0) -> Client:
     """A client with the token given, or the one in the coordinator's data folder."""
-    return Api(url, token or read_token(data), patience_s=patience_s)
+    return Client(url, token or read_token(data), patience_s=patience_s)
 
 
 def read_token(data: Path | None) -> str:

@@ -13,11 +13,11 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from kiln_schemas.client import Client
 from kiln_schemas.errors import Unreachable
 from kiln_schemas.job import JobView, StageView, TaskView
 from kiln_schemas.states import FINAL_JOB_STATES
 from kiln_schemas.tasks import TaskKind
-from kiln_service.cli.api import Api
 from kiln_service.cli.output import duration, notices
 
 POLL_S: Final = 0.5
@@ -116,7 +116,7 @@ def details(stage: StageView, fits: Sequence[TaskView]) -> str:
 
 
 def follow(
-    api: Api,
+    api: Client,
     job_id: str,
     display: Display,
     *,

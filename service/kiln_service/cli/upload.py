@@ -4,14 +4,14 @@ from uuid import uuid4
 
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 
+from kiln_schemas.client import Client
 from kiln_schemas.job import JobRequest, JobView
-from kiln_service.cli.api import Api
 from kiln_service.cli.bundle import LocalBundle
 from kiln_service.cli.output import notices
 
 
 def upload_and_submit(
-    api: Api, local: LocalBundle, request: JobRequest, *, key: str | None = None, bar: bool = True
+    api: Client, local: LocalBundle, request: JobRequest, *, key: str | None = None, bar: bool = True
 ) -> JobView:
     """Upload what is missing, with a bar on a terminal if `bar`, and submit under an `Idempotency-Key`.
 

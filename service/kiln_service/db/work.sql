@@ -56,11 +56,14 @@ WHERE queue.id = ANY(%(queue_jobs)s) AND tasks.id = queue.args ->> 'task_id';
 SELECT pg_notify('kiln_queued', %(kinds)s);
 
 -- name: add_event
--- Append to a job's history and wake who watches it; the job is locked.
+-- Append to a job's history, wake who watches it and note whom to tell; the job is locked.
 WITH added AS (
     INSERT INTO events (job_id, task_id, kind, actor, detail)
     VALUES (%(job_id)s, %(task_id)s, %(kind)s, %(actor)s, %(detail)s)
-    RETURNING job_id
+    RETURNING id, job_id, kind
+), told AS (
+    INSERT INTO deliveries (webhook_id, event_id)
+    SELECT webhooks.id, added.id FROM added JOIN webhooks ON added.kind = ANY(webhooks.events)
 )
 SELECT pg_notify('kiln_event', job_id) FROM added;
 

@@ -18,7 +18,19 @@ from pydantic import TypeAdapter
 
 from kiln_schemas.errors import AuthError, Unreachable, error_of_answer
 from kiln_schemas.job import JobChange, JobPage, JobRequest, JobView, MissingReply, MissingRequest, TaskView
-from kiln_schemas.operators import GcReport, GcRequest, NewToken, Order, TokenRequest, TokenView, WorkerView
+from kiln_schemas.operators import (
+    DeliveryView,
+    GcReport,
+    GcRequest,
+    NewToken,
+    NewWebhook,
+    Order,
+    TokenRequest,
+    TokenView,
+    WebhookRequest,
+    WebhookView,
+    WorkerView,
+)
 from kiln_schemas.states import JobState
 from kiln_schemas.tasks import Artifact, TaskKind
 
@@ -29,7 +41,7 @@ MISSING_AT_ONCE: Final = 4096
 OnBytes = Callable[[int], None]
 
 
-class Api:
+class Client:
     """One coordinator as a client sees it. Without a token only `ready` is answered."""
 
     def __init__(self, url: str, token: str | None, *, patience_s: float) -> None:
@@ -134,6 +146,24 @@ class Api:
         """Free what archived jobs left behind."""
         reply = self._call("POST", "/v1/gc", json=request.model_dump(mode="json"))
         return GcReport.model_validate_json(reply.content)
+
+    def webhooks(self) -> tuple[WebhookView, ...]:
+        """All webhooks, without their secrets."""
+        return TypeAdapter(tuple[WebhookView, ...]).validate_json(self._call("GET", "/v1/webhooks").content)
+
+    def add_webhook(self, request: WebhookRequest) -> NewWebhook:
+        """Tell a URL of jobs' events from now on."""
+        reply = self._call("POST", "/v1/webhooks", json=request.model_dump(mode="json"))
+        return NewWebhook.model_validate_json(reply.content)
+
+    def remove_webhook(self, webhook_id: str) -> None:
+        """Tell it nothing more."""
+        self._call("DELETE", f"/v1/webhooks/{quote(webhook_id, safe='')}")
+
+    def deliveries(self, webhook_id: str) -> tuple[DeliveryView, ...]:
+        """What became of each telling, newest first."""
+        reply = self._call("GET", f"/v1/webhooks/{quote(webhook_id, safe='')}/deliveries")
+        return TypeAdapter(tuple[DeliveryView, ...]).validate_json(reply.content)
 
     def task_log(self, task_id: str) -> str:
         """What the attempts of a task wrote."""

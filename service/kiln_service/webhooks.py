@@ -1,0 +1,146 @@
+"""Webhooks: a job's events told to other programs, signed, tried again with growing pauses.
+
+A delivery is a row that is written with its event, in the same transaction: what happened is told, even by a
+coordinator that starts later. Receivers may be told twice (`X-Lightkiln-Delivery` names the delivery) and out of order.
+
+    X-Lightkiln-Signature: t=UNIX_SECONDS,v1=HEX    HEX = HMAC-SHA256(secret, "UNIX_SECONDS." + body)
+"""
+
+import asyncio
+import hashlib
+import hmac
+import json
+import logging
+import secrets
+import time
+from typing import Final
+
+import httpx
+import psycopg
+from psycopg.rows import DictRow
+from psycopg.types.json import Jsonb
+from psycopg_pool import PoolTimeout
+
+from kiln_schemas import __version__
+from kiln_schemas.errors import NotFound
+from kiln_schemas.operators import DeliveryView, NewWebhook, WebhookRequest, WebhookView
+from kiln_service.config import Timing
+from kiln_service.db import Database
+from kiln_service.ids import new_id
+
+log = logging.getLogger(__name__)
+
+MAX_ATTEMPTS: Final = 12
+LONGEST_PAUSE_S: Final = 3600.0
+TIMEOUT_S: Final = 10.0
+LEASE_S: Final = 60.0
+AT_ONCE: Final = 16
+
+
+async def add_webhook(database: Database, request: WebhookRequest, actor: str) -> NewWebhook:
+    """Tell a URL of events from now on; the secret is told this once."""
+    secret = secrets.token_urlsafe(32)
+    async with database.transaction() as tx:
+        events = [event.value for event in request.events]
+        row = await tx.one(
+            "insert_webhook", id=new_id(), url=str(request.url), events=events, secret=secret, actor=actor
+        )
+        await tx.run(
+            "add_audit", actor=actor, action="webhook.created", target=row["url"], detail=Jsonb({"id": row["id"]})
+        )
+    return NewWebhook(**_view(row).model_dump(), secret=secret)
+
+
+async def list_webhooks(database: Database) -> tuple[WebhookView, ...]:
+    """All webhooks, without their secrets."""
+    async with database.transaction() as tx:
+        return tuple(_view(row) for row in await tx.all("list_webhooks"))
+
+
+async def remove_webhook(database: Database, webhook_id: str, actor: str) -> None:
+    """Tell it nothing more; NotFound where there is none."""
+    async with database.transaction() as tx:
+        row = await tx.maybe("delete_webhook", id=webhook_id)
+        if row is None:
+            raise NotFound(f"no webhook '{webhook_id}'", where="webhook", remedy="GET /v1/webhooks lists them.")
+        detail = Jsonb({"id": webhook_id})
+        await tx.run("add_audit", actor=actor, action="webhook.removed", target=row["url"], detail=detail)
+
+
+async def list_deliveries(database: Database, webhook_id: str, limit: int) -> tuple[DeliveryView, ...]:
+    """What became of each telling, newest first."""
+    async with database.transaction() as tx:
+        rows = await tx.all("list_deliveries", webhook_id=webhook_id, limit=limit)
+    return tuple(DeliveryView.model_validate({name: row[name] for name in DeliveryView.model_fields}) for row in rows)
+
+
+class Deliverer:
+    """Tells what is due, as long as its coordinator runs; several coordinators share the work."""
+
+    def __init__(self, database: Database, timing: Timing) -> None:
+        self._database, self._timing = database, timing
+
+    async def run(self) -> None:
+        """Until canceled; a database that is away for a while is waited for."""
+        async with httpx.AsyncClient(timeout=TIMEOUT_S, follow_redirects=False) as http:
+            while True:
+                taken = 0
+                try:
+                    taken = await self._deliver_due(http)
+                except (psycopg.OperationalError, PoolTimeout) as error:
+                    log.warning("webhooks wait for the database: %s", error)
+                except Exception:
+                    log.exception("a pass of the webhooks failed")
+                if taken < AT_ONCE:
+                    await asyncio.sleep(self._timing.maintenance_s)
+
+    async def _deliver_due(self, http: httpx.AsyncClient) -> int:
+        async with self._database.transaction() as tx:
+            rows = await tx.all("take_due_deliveries", lease_s=LEASE_S, limit=AT_ONCE)
+        await asyncio.gather(*(self._deliver(http, row) for row in rows))
+        return len(rows)
+
+    async def _deliver(self, http: httpx.AsyncClient, row: DictRow) -> None:
+        status, error = await _send(http, row)
+        told = status is not None and 200 <= status < 300
+        last = row["attempts"] >= MAX_ATTEMPTS
+        outcome = "delivered" if told else "failed" if last else "pending"
+        pause = min(LONGEST_PAUSE_S, self._timing.maintenance_s * 2 ** row["attempts"])
+        if not told:
+            log.warning("webhook %s: attempt %d failed: %s", row["url"], row["attempts"], error or f"status {status}")
+        async with self._database.transaction() as tx:
+            await tx.run("end_delivery", id=row["id"], outcome=outcome, status=status, error=error, pause_s=pause)
+
+
+def signature(secret: str, seconds: int, body: bytes) -> str:
+    """The header's value."""
+    digest = hmac.new(secret.encode(), f"{seconds}.".encode() + body, hashlib.sha256).hexdigest()
+    return f"t={seconds},v1={digest}"
+
+
+async def _send(http: httpx.AsyncClient, row: DictRow) -> tuple[int | None, str | None]:
+    """Status of the answer, or why there is none."""
+    document = {
+        "event": row["kind"],
+        "event_id": row["event_id"],
+        "at": row["at"].isoformat(),
+        "job_id": row["job_id"],
+        "actor": row["actor"],
+        "detail": row["detail"],
+    }
+    body = json.dumps(document, sort_keys=True).encode()
+    headers = {
+        "Content-Type": "application/json",
+        "User-Agent": f"lightkiln/{__version__}",
+        "X-Lightkiln-Event": row["kind"],
+        "X-Lightkiln-Delivery": str(row["id"]),
+        "X-Lightkiln-Signature": signature(row["secret"], int(time.time()), body),
+    }
+    try:
+        return (await http.post(row["url"], content=body, headers=headers)).status_code, None
+    except (httpx.HTTPError, httpx.InvalidURL) as error:
+        return None, str(error) or type(error).__name__
+
+
+def _view(row: DictRow) -> WebhookView:
+    return WebhookView.model_validate({name: row[name] for name in WebhookView.model_fields})

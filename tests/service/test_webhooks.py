@@ -1,0 +1,118 @@
+"""Jobs told to a real HTTP server: signed, tried again where it refuses, by a coordinator that starts later."""
+
+import hashlib
+import hmac
+import json
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+
+class Receiver(BaseHTTPRequestHandler):
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        self.server.told.append((dict(self.headers), body))
+        answers = self.server.answers
+        self.send_response(answers.pop(0) if answers else 204)
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def receiver() -> Iterator[ThreadingHTTPServer]:
+    """`told`: what came; `answers`: statuses of the next answers, 204 afterwards."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Receiver)
+    server.told, server.answers = [], []
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield server
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def add(home, server, **body):
+    url = f"http://127.0.0.1:{server.server_address[1]}/hook"
+    return home.client.post("/v1/webhooks", json={"url": url} | body).raise_for_status().json()
+
+
+def fail_a_job(home):
+    job, worker = home.submit(), home.worker()
+    worker.fail(worker.must_claim(), retryable=False).raise_for_status()
+    return job["id"]
+
+
+def test_an_end_is_told_with_a_signature(start, fast, receiver, eventually):
+    with start(timing=fast) as home:
+        hook = add(home, receiver)
+        job = fail_a_job(home)
+        eventually(lambda: receiver.told)
+        ((headers, body),) = receiver.told
+        document = json.loads(body)
+        assert (document["event"], document["job_id"]) == ("job.failed", job)
+        assert document["detail"]["problem"]["detail"] == "it broke" and headers["X-Lightkiln-Event"] == "job.failed"
+        seconds, digest = (part.partition("=")[2] for part in headers["X-Lightkiln-Signature"].split(","))
+        expected = hmac.new(hook["secret"].encode(), f"{seconds}.".encode() + body, hashlib.sha256).hexdigest()
+        assert digest == expected and abs(time.time() - int(seconds)) < 30
+        (delivery,) = eventually(lambda: [d for d in deliveries(home, hook) if d["outcome"] == "delivered"])
+        assert (delivery["attempts"], delivery["status"]) == (1, 204)
+        (listed,) = home.client.get("/v1/webhooks").json()
+        assert "secret" not in listed and listed["created_by"] == "client:owner"
+
+
+def deliveries(home, hook):
+    return home.client.get(f"/v1/webhooks/{hook['id']}/deliveries").raise_for_status().json()
+
+
+def test_a_refusal_is_tried_again_until_it_is_taken(start, fast, receiver, eventually):
+    receiver.answers[:] = [500, 302]
+    with start(timing=fast) as home:
+        hook = add(home, receiver)
+        fail_a_job(home)
+        (delivery,) = eventually(lambda: [d for d in deliveries(home, hook) if d["outcome"] == "delivered"])
+        assert delivery["attempts"] == 3 == len(receiver.told)
+        assert len({headers["X-Lightkiln-Delivery"] for headers, _ in receiver.told}) == 1
+
+
+def test_nobody_there_is_given_up_after_twelve_attempts(start, fast, receiver, eventually, monkeypatch):
+    monkeypatch.setattr("kiln_service.webhooks.LONGEST_PAUSE_S", 0.01)
+    with start(timing=fast) as home:
+        hook = home.client.post("/v1/webhooks", json={"url": "http://127.0.0.1:9/"}).json()
+        fail_a_job(home)
+        (delivery,) = eventually(lambda: [d for d in deliveries(home, hook) if d["outcome"] == "failed"], 30)
+        assert delivery["attempts"] == 12 and delivery["status"] is None and delivery["error"]
+
+
+def test_what_happened_before_a_crash_is_told_by_the_next_coordinator(start, fast, receiver, eventually):
+    with start(timing=fast.model_copy(update={"maintenance_s": 600})) as home:
+        time.sleep(0.3)
+        add(home, receiver)
+        fail_a_job(home)
+    assert receiver.told == []
+    with start(timing=fast):
+        eventually(lambda: receiver.told)
+
+
+def test_only_the_events_asked_for_are_told_and_none_after_the_removal(start, fast, receiver, eventually):
+    with start(timing=fast) as home:
+        hook = add(home, receiver, events=["job.created"])
+        fail_a_job(home)
+        eventually(lambda: receiver.told)
+        assert home.client.delete(f"/v1/webhooks/{hook['id']}").status_code == 204
+        fail_a_job(home)
+        time.sleep(0.5)
+        assert [json.loads(body)["event"] for _, body in receiver.told] == ["job.created"]
+        assert home.client.delete(f"/v1/webhooks/{hook['id']}").status_code == 404
+
+
+@pytest.mark.parametrize(
+    "url", ["ftp://a/", "file:///etc/passwd", "http://", "http://user:pw@host/", "x", "http://a b/"]
+)
+def test_urls_that_are_refused(shared, url):
+    assert shared.client.post("/v1/webhooks", json={"url": url}).status_code == 422
