@@ -15,6 +15,7 @@ import torch
 from scipy.stats import qmc
 from torch import Tensor
 
+from kiln_workers.shade.algorithm import kernel_terms
 from kiln_workers.sphere import ggx
 
 ALPHAS = (0.04, 0.06, 0.09, 0.12, 0.16, 0.2, 0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.75, 1.0)
@@ -66,13 +67,6 @@ class Grid:
         self.directions, self.root, self.solid_angles = (torch.from_numpy(np.stack(part)).float() for part in lobes)
         self.alpha, self.cosine = torch.tensor(places).unbind(-1)
 
-    @property
-    def terms(self) -> Tensor:
-        """1, y, x, yy, yx, xx, yyy, yyx, yxx, xxx of alpha y and o.n x: [G, 10]."""
-        y, x = self.alpha, self.cosine
-        one = torch.ones_like(x)
-        return torch.stack([one, y, x, y * y, y * x, x * x, y**3, y * y * x, y * x * x, x**3], dim=-1)
-
     def distances(self, parameters: Tensor) -> Tensor:
         """Squared Hellinger distances, times 2, of kernels with parameters [G, 3 or 7]: [G]."""
         kernel = self._gaussian(parameters[:, :3])
@@ -120,8 +114,9 @@ def main() -> None:
     start = torch.tensor(START[parser.parse_args().gaussians])
     grid = Grid()
     free = descend(grid, start.repeat(len(grid.alpha), 1), None, "at each place")
-    first = torch.linalg.lstsq(grid.terms, free.clamp(-6.0, 6.0)).solution
-    for row in descend(grid, first, grid.terms, "polynomials").tolist():
+    terms = kernel_terms(grid.cosine, grid.alpha)
+    first = torch.linalg.lstsq(terms, free.clamp(-6.0, 6.0)).solution
+    for row in descend(grid, first, terms, "polynomials").tolist():
         print("(" + ", ".join(f"{value:.5g}" for value in row) + "),")
 
 

@@ -47,7 +47,7 @@ class Blobs:
         self._database = database
         self._incoming = incoming
         self._limits = limits
-        self._folder = _local_folder(url)
+        self._folder = local_folder(url)
         for folder in filter(None, (self._incoming, self._folder)):
             folder.mkdir(parents=True, exist_ok=True)
         self._objects: ObjectStore = open_objects(url)
@@ -212,7 +212,7 @@ def _key(sha256: str) -> str:
     return f"{sha256[:2]}/{sha256}"
 
 
-def _local_folder(url: str) -> Path | None:
+def local_folder(url: str) -> Path | None:
     """The folder of a file:// URL, None for other storage."""
     parts = urlparse(url)
     return Path(unquote(parts.path)) if parts.scheme == "file" else None

@@ -7,18 +7,16 @@ Blobs go with the coordinator's next collection. A run that is cut off is repeat
 
 import asyncio
 import shutil
-from pathlib import Path
-from urllib.parse import unquote, urlparse
 
 import obstore
-from psycopg.types.json import Jsonb
 
 from kiln_schemas.operators import Freed, GcReport
 from kiln_schemas.states import JobState
-from kiln_service.blobs import open_objects
+from kiln_service.blobs import local_folder, open_objects
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, Tx
 from kiln_service.jobs import lock_job
+from kiln_service.operators import record
 
 
 class _DryRun(Exception):
@@ -39,7 +37,7 @@ async def free_archived(
     if freed and not dry_run:
         async with database.transaction() as tx:
             detail = {"jobs": [one.job_id for one in freed], "days": days}
-            await tx.run("add_audit", actor=actor, action="gc", target=f"{len(freed)} jobs", detail=Jsonb(detail))
+            await record(tx, actor, "gc", f"{len(freed)} jobs", detail)
     return GcReport(dry_run=dry_run, jobs=tuple(freed))
 
 
@@ -70,8 +68,8 @@ async def _needed(tx: Tx, job_id: str, stores: list[str]) -> set[str]:
 
 
 async def _exists(url: str) -> bool:
-    if url.startswith("file:"):
-        return _path(url).is_dir()
+    if (folder := local_folder(url)) is not None:
+        return folder.is_dir()
     pages = obstore.list(open_objects(url), chunk_size=1)
     async for page in pages:
         return len(page) > 0
@@ -82,13 +80,9 @@ async def _delete(url: str, base: str) -> None:
     """Delete a store of this coordinator; one that an earlier configuration put elsewhere is left alone."""
     if not url.startswith(f"{base}/") or not url.endswith(".zarr"):
         return
-    if url.startswith("file:"):
-        await asyncio.to_thread(shutil.rmtree, _path(url), ignore_errors=True)
+    if (folder := local_folder(url)) is not None:
+        await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
         return
     store = open_objects(url)
     async for page in obstore.list(store, chunk_size=1000):
         await obstore.delete_async(store, [entry["path"] for entry in page])
-
-
-def _path(url: str) -> Path:
-    return Path(unquote(urlparse(url).path))

@@ -128,7 +128,7 @@ async def retry(database: Database, job_id: str, actor: str) -> None:
     async with database.transaction() as tx:
         job = await lock_job(tx, job_id)
         _require(job, {JobState.FAILED, JobState.CANCELED}, "retried")
-        kinds = {TaskKind(row["kind"]) for row in await tx.all("first_unfinished", job_id=job.id)}
+        kinds = {TaskKind(row["kind"]) for row in await tx.all("unfinished_kinds", job_id=job.id)}
         stage = next((stage for stage in METHODS[job.method].stages if stage in kinds), None)
         if stage is None:
             raise Conflict(

@@ -20,7 +20,7 @@ from kiln_schemas.operators import (
     WorkerView,
 )
 from kiln_service.config import OWN_TOKEN, ServiceConfig
-from kiln_service.db import Database, Tx
+from kiln_service.db import Database, Tx, picked
 
 OFFLINE_S: Final = 60.0
 FORGOTTEN_S: Final = 7 * 86400.0
@@ -50,14 +50,14 @@ async def create_token(database: Database, config: ServiceConfig, request: Token
             raise Conflict(
                 f"there is a token '{request.name}'", where="name", remedy="Revoke it first, or choose another name."
             )
-        await _record(tx, actor, "token.created", request.name, {"scopes": [scope.value for scope in scopes]})
-    return NewToken(**_token_view(row).model_dump(), token=token)
+        await record(tx, actor, "token.created", request.name, {"scopes": [scope.value for scope in scopes]})
+    return NewToken(**picked(TokenView, row).model_dump(), token=token)
 
 
 async def list_tokens(database: Database) -> tuple[TokenView, ...]:
     """All tokens that were made here."""
     async with database.transaction() as tx:
-        return tuple(_token_view(row) for row in await tx.all("list_tokens"))
+        return tuple(picked(TokenView, row) for row in await tx.all("list_tokens"))
 
 
 async def revoke_token(database: Database, name: str, actor: str) -> None:
@@ -69,7 +69,7 @@ async def revoke_token(database: Database, name: str, actor: str) -> None:
                 where="name",
                 remedy="Tokens of the configuration and of the data folder are removed there.",
             )
-        await _record(tx, actor, "token.revoked", name)
+        await record(tx, actor, "token.revoked", name)
 
 
 async def list_workers(database: Database) -> tuple[WorkerView, ...]:
@@ -85,7 +85,7 @@ async def order_worker(database: Database, worker_id: str, order: Order, actor: 
         row = await tx.maybe("order_worker", id=worker_id, orders=_ORDERS[order])
         if row is None:
             raise NotFound(f"no worker '{worker_id}'", where="worker", remedy="GET /v1/workers lists them.")
-        await _record(tx, actor, f"worker.{order.value}", row["name"], {"worker": worker_id})
+        await record(tx, actor, f"worker.{order.value}", row["name"], {"worker": worker_id})
 
 
 async def list_audit(database: Database, before: int | None, limit: int) -> tuple[AuditEntry, ...]:
@@ -94,12 +94,9 @@ async def list_audit(database: Database, before: int | None, limit: int) -> tupl
         return tuple(AuditEntry.model_validate(row) for row in await tx.all("list_audit", before=before, limit=limit))
 
 
-async def _record(tx: Tx, actor: str, action: str, target: str, detail: Mapping[str, Any] | None = None) -> None:
+async def record(tx: Tx, actor: str, action: str, target: str, detail: Mapping[str, Any] | None = None) -> None:
+    """Write down who did what to what, in the transaction that does it."""
     await tx.run("add_audit", actor=actor, action=action, target=target, detail=Jsonb(dict(detail or {})))
-
-
-def _token_view(row: DictRow) -> TokenView:
-    return TokenView.model_validate({name: row[name] for name in TokenView.model_fields})
 
 
 def _worker_view(row: DictRow) -> WorkerView:

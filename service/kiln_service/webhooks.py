@@ -18,15 +18,15 @@ from typing import Final
 import httpx
 import psycopg
 from psycopg.rows import DictRow
-from psycopg.types.json import Jsonb
 from psycopg_pool import PoolTimeout
 
 from kiln_schemas import __version__
 from kiln_schemas.errors import NotFound
 from kiln_schemas.operators import DeliveryView, NewWebhook, WebhookRequest, WebhookView
 from kiln_service.config import Timing
-from kiln_service.db import Database
+from kiln_service.db import Database, picked
 from kiln_service.ids import new_id
+from kiln_service.operators import record
 
 log = logging.getLogger(__name__)
 
@@ -45,16 +45,14 @@ async def add_webhook(database: Database, request: WebhookRequest, actor: str) -
         row = await tx.one(
             "insert_webhook", id=new_id(), url=str(request.url), events=events, secret=secret, actor=actor
         )
-        await tx.run(
-            "add_audit", actor=actor, action="webhook.created", target=row["url"], detail=Jsonb({"id": row["id"]})
-        )
-    return NewWebhook(**_view(row).model_dump(), secret=secret)
+        await record(tx, actor, "webhook.created", row["url"], {"id": row["id"]})
+    return NewWebhook(**picked(WebhookView, row).model_dump(), secret=secret)
 
 
 async def list_webhooks(database: Database) -> tuple[WebhookView, ...]:
     """All webhooks, without their secrets."""
     async with database.transaction() as tx:
-        return tuple(_view(row) for row in await tx.all("list_webhooks"))
+        return tuple(picked(WebhookView, row) for row in await tx.all("list_webhooks"))
 
 
 async def remove_webhook(database: Database, webhook_id: str, actor: str) -> None:
@@ -63,15 +61,14 @@ async def remove_webhook(database: Database, webhook_id: str, actor: str) -> Non
         row = await tx.maybe("delete_webhook", id=webhook_id)
         if row is None:
             raise NotFound(f"no webhook '{webhook_id}'", where="webhook", remedy="GET /v1/webhooks lists them.")
-        detail = Jsonb({"id": webhook_id})
-        await tx.run("add_audit", actor=actor, action="webhook.removed", target=row["url"], detail=detail)
+        await record(tx, actor, "webhook.removed", row["url"], {"id": webhook_id})
 
 
 async def list_deliveries(database: Database, webhook_id: str, limit: int) -> tuple[DeliveryView, ...]:
     """What became of each telling, newest first."""
     async with database.transaction() as tx:
         rows = await tx.all("list_deliveries", webhook_id=webhook_id, limit=limit)
-    return tuple(DeliveryView.model_validate({name: row[name] for name in DeliveryView.model_fields}) for row in rows)
+    return tuple(picked(DeliveryView, row) for row in rows)
 
 
 class Deliverer:
@@ -140,7 +137,3 @@ async def _send(http: httpx.AsyncClient, row: DictRow) -> tuple[int | None, str 
         return (await http.post(row["url"], content=body, headers=headers)).status_code, None
     except (httpx.HTTPError, httpx.InvalidURL) as error:
         return None, str(error) or type(error).__name__
-
-
-def _view(row: DictRow) -> WebhookView:
-    return WebhookView.model_validate({name: row[name] for name in WebhookView.model_fields})

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass, fields
 from datetime import datetime
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from psycopg.rows import DictRow
 
+from kiln_schemas.base import Contract
 from kiln_schemas.camera import Camera
 from kiln_schemas.errors import Problem
 from kiln_schemas.gates import GateResult, Gates
@@ -13,11 +14,18 @@ from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Bundle, Progress, TaskKind
 
+C = TypeVar("C", bound=Contract)
+
 
 class _Row:
     @classmethod
     def _picked(cls, row: DictRow) -> dict[str, Any]:
         return {field.name: row[field.name] for field in fields(cls)}  # type: ignore[arg-type]
+
+
+def picked(contract: type[C], row: DictRow) -> C:
+    """A contract of those of a row's columns that it names."""
+    return contract.model_validate({name: row[name] for name in contract.model_fields})
 
 
 @dataclass(frozen=True)
@@ -37,7 +45,6 @@ class JobRow(_Row):
     priority: int
     labels: dict[str, str]
     submitter: str | None
-    request_sha256: str | None
     renders_of: str | None
     notes: tuple[str, ...]
     error: Problem | None

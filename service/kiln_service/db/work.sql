@@ -112,7 +112,7 @@ LEFT JOIN procrastinate_jobs AS queue ON queue.id = tasks.queue_job AND queue.st
 WHERE tasks.job_id = %(job_id)s AND tasks.state = 'queued' AND queue.id IS NULL
 ORDER BY tasks.ordinal;
 
--- name: first_unfinished
+-- name: unfinished_kinds
 -- Kinds of a job's tasks that have not all completed.
 SELECT DISTINCT kind FROM tasks WHERE job_id = %(job_id)s AND state <> 'completed';
 

@@ -112,13 +112,18 @@ def reflection_kernels(surface: Surface) -> tuple[Kernel, Kernel]:
     normalised microfacet lobe by the Hellinger distance, whose mean square is 0.03 (one Gaussian 0.11, eq. 18 0.27).
     """
     x, y = surface.cosine, surface.alpha.clamp(ALBEDO_LEAST_ALPHA, 1.0)
-    terms = torch.stack([torch.ones_like(x), y, x, y * y, y * x, x * x, y**3, y * y * x, y * x * x, x**3], dim=-1)
-    fit = terms @ terms.new_tensor(KERNEL_FIT)
+    fit = kernel_terms(x, y) @ x.new_tensor(KERNEL_FIT)
     across, tail = _across(surface), torch.sigmoid(fit[:, 6])
     return (
         _gaussian(surface, across, fit[:, :3], y, 1.0 - tail),
         _gaussian(surface, across, fit[:, 3:6], y, tail),
     )
+
+
+def kernel_terms(cosine: Tensor, alpha: Tensor) -> Tensor:
+    """1, y, x, yy, yx, xx, yyy, yyx, yxx, xxx of o.n x [P] and alpha y [P]: [P, 10]."""
+    x, y = cosine, alpha
+    return torch.stack([torch.ones_like(x), y, x, y * y, y * x, x * x, y**3, y * y * x, y * x * x, x**3], dim=-1)
 
 
 def _gaussian(surface: Surface, across: Tensor, fit: Tensor, alpha: Tensor, integral: Tensor) -> Kernel:
