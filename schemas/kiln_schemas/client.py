@@ -17,7 +17,16 @@ import httpx
 from pydantic import TypeAdapter
 
 from kiln_schemas.errors import AuthError, Unreachable, error_of_answer
-from kiln_schemas.job import JobChange, JobPage, JobRequest, JobView, MissingReply, MissingRequest, TaskView
+from kiln_schemas.job import (
+    JobChange,
+    JobPage,
+    JobRequest,
+    JobView,
+    MissingReply,
+    MissingRequest,
+    RequeueRequest,
+    TaskView,
+)
 from kiln_schemas.operators import (
     DeliveryView,
     GcReport,
@@ -25,6 +34,7 @@ from kiln_schemas.operators import (
     NewToken,
     NewWebhook,
     Order,
+    SleepSchedule,
     TokenRequest,
     TokenView,
     WebhookRequest,
@@ -116,6 +126,12 @@ class Client:
         """Ask something of a job."""
         return JobView.model_validate_json(self._call("POST", f"/v1/jobs/{quote(job_id, safe='')}/{action}").content)
 
+    def requeue(self, job_id: str, wanted: RequeueRequest) -> JobView:
+        """Do tasks again that are done, and what follows from them."""
+        body = wanted.model_dump(mode="json", exclude_none=True)
+        path = f"/v1/jobs/{quote(job_id, safe='')}/requeue"
+        return JobView.model_validate_json(self._call("POST", path, json=body).content)
+
     def change(self, job_id: str, wanted: JobChange) -> JobView:
         """Rank or label a job anew."""
         body = wanted.model_dump(mode="json", exclude_none=True)
@@ -128,6 +144,18 @@ class Client:
     def order_worker(self, worker_id: str, order: Order) -> None:
         """Tell a worker to sleep, to wake or to leave."""
         self._call("POST", f"/v1/workers/{quote(worker_id, safe='')}/orders/{order.value}")
+
+    def unblock_worker(self, worker_id: str) -> None:
+        """Let a worker take tasks of all jobs again."""
+        self._call("DELETE", f"/v1/workers/{quote(worker_id, safe='')}/blocks")
+
+    def set_schedule(self, worker: str, schedule: SleepSchedule | None) -> None:
+        """Let workers of a name sleep at given times, or only when they are told to."""
+        path = f"/v1/schedules/{quote(worker, safe='')}"
+        if schedule is None:
+            self._call("DELETE", path)
+        else:
+            self._call("PUT", path, json=schedule.model_dump(mode="json"))
 
     def tokens(self) -> tuple[TokenView, ...]:
         """Access tokens that were made, without themselves."""
@@ -165,9 +193,24 @@ class Client:
         reply = self._call("GET", f"/v1/webhooks/{quote(webhook_id, safe='')}/deliveries")
         return TypeAdapter(tuple[DeliveryView, ...]).validate_json(reply.content)
 
-    def task_log(self, task_id: str) -> str:
-        """What the attempts of a task wrote."""
-        return self._call("GET", f"/v1/tasks/{quote(task_id, safe='')}/log").text
+    def task_log(self, task_id: str, tail: int | None = None) -> str:
+        """What the attempts of a task wrote, or the last `tail` lines of it."""
+        params = {} if tail is None else {"tail": tail}
+        return self._call("GET", f"/v1/tasks/{quote(task_id, safe='')}/log", params=params).text
+
+    def follow_log(self, task_id: str, tail: int | None = None) -> Iterator[str]:
+        """The same in pieces, and what is written until the task is over."""
+        path = f"/v1/tasks/{quote(task_id, safe='')}/log"
+        params: dict[str, Any] = {"follow": True} | ({} if tail is None else {"tail": tail})
+        quiet = httpx.Timeout(60.0, connect=5.0, read=None)
+        try:
+            with self._http.stream("GET", path, params=params, timeout=quiet) as response:
+                if not response.is_success:
+                    raise error_of_answer(response.read(), response.status_code, f"GET {path}", self.url)
+                yield from response.iter_text()
+        except httpx.TransportError as error:
+            reason = str(error) or type(error).__name__
+            raise Unreachable(f"the log broke off ({reason})", where=self.url, remedy="Ask for it again.") from None
 
     def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
         """What a job published."""

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from datetime import datetime
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field
 
@@ -12,7 +12,7 @@ from kiln_schemas.errors import InputError, Problem
 from kiln_schemas.gates import Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
-from kiln_schemas.tasks import Bundle, Progress, Sha256, TaskKind
+from kiln_schemas.tasks import Bundle, Progress, Sha256, Tags, TaskKind
 
 DEFAULT_PRIORITY: Final = 50
 
@@ -38,6 +38,8 @@ class JobRequest(Contract):
     priority: Priority = DEFAULT_PRIORITY
     labels: Labels = Field(default_factory=dict)
     """Free words to find the job by: project, shot, commit, ..."""
+    tags: Tags = ()
+    """Its tasks go to workers that have all of these tags."""
 
 
 class JobChange(Contract):
@@ -46,6 +48,26 @@ class JobChange(Contract):
     priority: Priority | None = None
     labels: Labels | None = None
     """All labels from now on."""
+    tags: Tags | None = None
+    """All tags that its workers need from now on."""
+
+
+TexelRange = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]]
+
+
+class RequeueRequest(Contract):
+    """Body of `POST /v1/jobs/{id}/requeue`: which tasks to do again, though they are done; all of the kind by default.
+
+    What follows from them waits for them and is done again too, and the package with it.
+    """
+
+    kind: Literal[TaskKind.RENDER, TaskKind.FIT, TaskKind.REFINE, TaskKind.PACKAGE]
+    rows: TexelRange | None = None
+    """Only tiles or blocks with texels in these rows of the light map: the first, and the one after the last."""
+    columns: TexelRange | None = None
+    """The same of columns."""
+    labels: tuple[str, ...] | None = Field(default=None, max_length=4096)
+    """Only tasks with these labels."""
 
 
 class StageView(Contract):
@@ -56,6 +78,8 @@ class StageView(Contract):
     completed: int
     active: int
     failed: int
+    soft_failed: int = 0
+    """Of those that are queued: after attempts that ended badly."""
     fraction: float
     """0..1, running tasks counted by their own progress."""
     seconds: float
@@ -82,6 +106,7 @@ class JobView(Contract):
     """Empty until the package has been measured."""
     priority: int = DEFAULT_PRIORITY
     labels: dict[str, str] = Field(default_factory=dict)
+    tags: tuple[str, ...] = ()
     submitter: str | None = None
     """Name of the token it was submitted with."""
     renders_of: str | None = None

@@ -4,13 +4,14 @@ All data between tasks travel as content-addressed blobs through the coordinator
 light-field store, which workers write and read directly at `store_url`.
 """
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter, ValidationError
 
 from kiln_schemas.base import Contract
-from kiln_schemas.errors import Problem
+from kiln_schemas.errors import InputError, Problem
 from kiln_schemas.gates import Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings, Function
 
@@ -224,6 +225,10 @@ class Progress(Contract):
     loss: float | None = None
 
 
+Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$")]
+Tags = Annotated[tuple[Tag, ...], Field(max_length=32)]
+
+
 class WorkerRegistration(Contract):
     name: str = Field(min_length=1, max_length=128)
     kinds: tuple[TaskKind, ...] = Field(min_length=1)
@@ -231,6 +236,8 @@ class WorkerRegistration(Contract):
     threads: int = Field(gt=0)
     device: str
     version: str
+    tags: Tags = ()
+    """What it is good for beyond its kinds: jobs may require some."""
 
 
 class WorkerWelcome(Contract):
@@ -285,3 +292,15 @@ class Failure(Contract):
 class Checkpoint(Contract):
     attempt: int
     sha256: Sha256
+
+
+def read_tags(words: Sequence[str]) -> tuple[str, ...]:
+    """Tags of the command line; InputError where one is none."""
+    try:
+        return TypeAdapter(Tags).validate_python(tuple(dict.fromkeys(words)))
+    except ValidationError as error:
+        raise InputError(
+            f"'{error.errors()[0]['input']}' is refused as a tag",
+            where="--tag",
+            remedy="Use letters, digits and . _ -, at most 63 of them and at most 32 tags.",
+        ) from None

@@ -53,9 +53,20 @@ class Timing(Contract):
     database_s: float = Field(default=15.0, gt=0)
     """A request waits so long for a database connection before it is answered 503."""
     maintenance_s: float = Field(default=5.0, gt=0)
-    """Between two passes of the reaper and the reconciler."""
+    """Between two passes of the reaper."""
+    block_s: float = Field(default=3600.0, gt=0)
+    """A worker that fails tasks of a kind of a job gets no more of them for so long (`blocks`)."""
     blob_grace_s: float = Field(default=3600.0, gt=0)
     """A blob that nothing uses is kept this long after it was last uploaded or asked for."""
+
+
+class FailedTasks(Contract):
+    """A task that fails leaves the others to go on; a job of which so many failed fails at once."""
+
+    least: int = Field(default=10, ge=1)
+    """At least so many tasks of a kind,"""
+    of_all: float = Field(default=0.1, ge=0, le=1)
+    """and more than this share of all tasks of the kind."""
 
 
 class ServiceConfig(Contract):
@@ -75,6 +86,7 @@ class ServiceConfig(Contract):
     """Tokens besides the one in `<data>/token`."""
     max_attempts: int = Field(default=4, ge=1)
     """A task fails for good after this many attempts in a row that ended without a new checkpoint."""
+    failed_tasks: FailedTasks = FailedTasks()
     pool_size: int = Field(default=10, ge=2)
     """Database connections."""
     limits: Limits = Limits()

@@ -136,7 +136,7 @@ def test_metrics_tell_what_the_farm_does(home):
     assert reply.headers["content-type"].startswith("text/plain")
     families = text_string_to_metric_families(reply.text)
     found = {(s.name, *sorted(s.labels.values())): s.value for family in families for s in family.samples}
-    assert found["lightkiln_tasks", "queued", "render"] == 2
+    assert found["lightkiln_tasks", "queued", "render"] == found["lightkiln_tasks", "render", "soft-failed"] == 1
     assert found["lightkiln_tasks", "render", "waiting"] == 0
     assert found["lightkiln_tasks_completed_total", "render"] == 1
     assert found["lightkiln_task_seconds_total", "prepare"] == 0.5

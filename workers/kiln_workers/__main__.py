@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from kiln_schemas.errors import AuthError, InputError, InternalError, KilnError, MachineLacks
-from kiln_schemas.tasks import TaskKind
+from kiln_schemas.tasks import TaskKind, read_tags
 from kiln_workers.compare.arguments import add_compare
 from kiln_workers.runner.machine import claim_folder, cores, default_memory_bytes, parse_size
 from kiln_workers.shade.arguments import add_commands
@@ -46,6 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     worker.add_argument("--token", default=os.environ.get("LIGHTKILN_TOKEN"), help="or LIGHTKILN_TOKEN")
     worker.add_argument("--token-file", type=Path, help="file that holds the token")
     worker.add_argument("--kinds", default=",".join(TaskKind), help="kinds of tasks to take, separated by commas")
+    worker.add_argument("--tag", action="append", default=[], help="what it is good for, for jobs that require it")
     worker.add_argument("--memory", help="main memory to use, e.g. 4GiB")
     worker.add_argument("--threads", type=int, help="cores to use; all by default")
     worker.add_argument("--name", help="as the dashboard shows it; host name and process by default")
@@ -86,6 +87,7 @@ def _worker(options: argparse.Namespace) -> int:
                 token=token,
                 name=options.name or f"{platform.node()}-{os.getpid()}",
                 kinds=kinds,
+                tags=read_tags(options.tag),
                 memory_bytes=memory,
                 threads=threads,
                 folder=folder,

@@ -23,7 +23,7 @@ from kiln_schemas.gates import check_gates, read_cameras, read_gates
 from kiln_schemas.job import DEFAULT_PRIORITY, JobRequest, JobView, read_labels
 from kiln_schemas.settings import make_settings
 from kiln_schemas.states import FINAL_JOB_STATES, PUBLISHED_JOB_STATES, JobState
-from kiln_schemas.tasks import TaskKind
+from kiln_schemas.tasks import TaskKind, read_tags
 from kiln_service.cli import bake as baking
 from kiln_service.cli import options
 from kiln_service.cli.become import become
@@ -191,6 +191,7 @@ def submit(
     name: Annotated[str | None, typer.Option("--name", help="The job's name; the file's by default.")] = None,
     priority: options.JobPriority = DEFAULT_PRIORITY,
     label: options.Label = None,
+    tag: options.Tag = None,
     key: Annotated[
         str | None,
         typer.Option("--idempotency-key", help="Sent twice under the same key, a request makes one job."),
@@ -222,6 +223,7 @@ def submit(
         cameras=cameras,
         priority=priority,
         labels=read_labels(label or ()),
+        tags=read_tags(tag or ()),
     )
     with options.connect(url, token, data) as api:
         job = upload_and_submit(api, local, request, key=key)

@@ -55,6 +55,10 @@ JobPriority = Annotated[
 Label = Annotated[
     list[str] | None, typer.Option("--label", metavar="KEY=VALUE", help="To find jobs by; may be repeated.")
 ]
+Tag = Annotated[
+    list[str] | None,
+    typer.Option("--tag", metavar="TAG", help="Only workers with this tag do its tasks; may be repeated."),
+]
 Environment = Annotated[
     Path | None, typer.Option("--env", metavar="FILE", help="Distant light: an equirectangular HDR or EXR.")
 ]

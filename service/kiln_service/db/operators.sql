@@ -34,9 +34,15 @@ SELECT * FROM audit WHERE (%(before)s::bigint IS NULL OR id < %(before)s) ORDER 
 
 -- name: list_workers
 -- Workers that were seen of late, with the task that each has.
-SELECT workers.*, workers.seen < now() - make_interval(secs => %(offline_s)s) AS offline,
-       tasks.id AS task_id, tasks.job_id, tasks.kind, tasks.label
+SELECT workers.*, workers.seen < now() - make_interval(secs => %(offline_s)s) AS offline, now() AS now,
+       tasks.id AS task_id, tasks.job_id, tasks.kind, tasks.label,
+       schedules.days, schedules.begins, schedules.ends, schedules.timezone,
+       COALESCE((
+           SELECT jsonb_agg(jsonb_build_object('job_id', job_id, 'kind', kind, 'until', until) ORDER BY until DESC)
+           FROM blocks WHERE blocks.worker = workers.name AND until > now()
+       ), '[]') AS blocks
 FROM workers
+LEFT JOIN schedules ON schedules.worker = workers.name
 LEFT JOIN LATERAL (
     SELECT id, job_id, kind, label FROM tasks
     WHERE tasks.worker_id = workers.id AND tasks.state = 'active' ORDER BY started DESC LIMIT 1
@@ -47,6 +53,25 @@ ORDER BY workers.name, workers.registered;
 -- name: order_worker
 -- Tell a worker what to do from its next claim on.
 UPDATE workers SET orders = %(orders)s WHERE id = %(id)s RETURNING id, name;
+
+-- name: delete_blocks
+-- A worker may take tasks of all jobs again.
+DELETE FROM blocks WHERE worker = %(worker)s;
+
+-- name: find_schedule
+-- When workers of a name sleep, and what time it is.
+SELECT *, now() AS now FROM schedules WHERE worker = %(worker)s;
+
+-- name: put_schedule
+-- Let workers of a name sleep by a schedule.
+INSERT INTO schedules (worker, days, begins, ends, timezone)
+VALUES (%(worker)s, %(days)s, %(begins)s, %(ends)s, %(timezone)s)
+ON CONFLICT (worker) DO UPDATE
+SET days = EXCLUDED.days, begins = EXCLUDED.begins, ends = EXCLUDED.ends, timezone = EXCLUDED.timezone;
+
+-- name: delete_schedule
+-- Workers of a name have no schedule.
+DELETE FROM schedules WHERE worker = %(worker)s;
 
 -- name: count_tasks
 -- Tasks by kind and state.

@@ -75,6 +75,7 @@ class WorkerOptions:
     threads: int
     folder: Path
     """For temporary files and the blob cache; nobody else uses it."""
+    tags: tuple[str, ...] = ()
     cache_bytes: int = 8 << 30
     stages: str = "kiln_workers.stages"
 
@@ -137,6 +138,7 @@ class Worker:
             WorkerRegistration(
                 name=options.name,
                 kinds=options.kinds,
+                tags=options.tags,
                 memory_bytes=options.memory_bytes,
                 threads=options.threads,
                 device=self._device,
