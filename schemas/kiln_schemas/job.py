@@ -13,8 +13,8 @@ from kiln_schemas.errors import InputError, Problem
 from kiln_schemas.gates import Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
-from kiln_schemas.tasks import Bundle, Progress, Sha256, TaskKind
-from kiln_schemas.text import UNFIT
+from kiln_schemas.tasks import PATH_LENGTH, Bundle, Progress, Sha256, TaskKind
+from kiln_schemas.text import UNFIT, told
 
 DEFAULT_PRIORITY: Final = 50
 
@@ -158,9 +158,9 @@ def check_bundle_path(path: str) -> str:
         raise InputError(
             f"'{path}' holds a control character", where="bundle.files", remedy="Give the file another name."
         )
-    if any(len(part.encode()) > PART_BYTES for part in parts):
+    if len(path) > PATH_LENGTH or any(len(part.encode()) > PART_BYTES for part in parts):
         raise InputError(
-            f"a name in '{path}' has more than {PART_BYTES} bytes",
+            f"'{told(path, 80)}' is longer than {PATH_LENGTH} characters, or {PART_BYTES} bytes between two slashes",
             where="bundle.files",
             remedy="Give the file a shorter name.",
         )

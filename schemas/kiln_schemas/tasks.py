@@ -5,7 +5,7 @@ light-field store, which workers write and read directly at `store_url`.
 """
 
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
@@ -16,7 +16,8 @@ from kiln_schemas.settings import BakeSettings, Function
 from kiln_schemas.text import Log, Note
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-BundlePath = Annotated[str, Field(min_length=1, max_length=512)]
+PATH_LENGTH: Final = 512
+BundlePath = Annotated[str, Field(min_length=1, max_length=PATH_LENGTH)]
 Number = Annotated[int, Field(ge=0, lt=2**31)]
 """A count or an index that the database holds in 32 bits."""
 Bytes = Annotated[int, Field(ge=0, lt=2**63)]
