@@ -14,7 +14,7 @@ from kiln_schemas.gates import Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import PATH_LENGTH, Bundle, Progress, Sha256, TaskKind
-from kiln_schemas.text import UNFIT, told
+from kiln_schemas.text import LINE_BREAK, UNFIT, Line, told
 
 DEFAULT_PRIORITY: Final = 50
 
@@ -24,14 +24,14 @@ LABEL_LENGTH: Final = 128
 PART_BYTES: Final = 255
 """Longest name of a file or folder on the file systems in use."""
 LabelKey = Annotated[str, Field(pattern=LABEL_KEY)]
-LabelValue = Annotated[str, Field(max_length=LABEL_LENGTH)]
+LabelValue = Annotated[Line, Field(max_length=LABEL_LENGTH)]
 Labels = Annotated[dict[LabelKey, LabelValue], Field(max_length=32)]
 
 
 class JobRequest(Contract):
     """Body of `POST /v1/jobs`: a preset with overrides, or complete settings."""
 
-    name: str = Field(min_length=1, max_length=128)
+    name: Line = Field(min_length=1, max_length=128)
     bundle: Bundle
     preset: str | None = None
     set: tuple[str, ...] = Field(default=(), max_length=256)
@@ -154,7 +154,7 @@ def read_labels(words: Sequence[str], where: str = "--label") -> dict[str, str]:
 def check_bundle_path(path: str) -> str:
     """A relative POSIX path that stays inside its bundle and names a file anywhere, unchanged; InputError otherwise."""
     parts = path.split("/")
-    if UNFIT.search(path) or "\n" in path or "\t" in path:
+    if UNFIT.search(path) or LINE_BREAK.search(path):
         raise InputError(
             f"'{path}' holds a control character", where="bundle.files", remedy="Give the file another name."
         )

@@ -13,7 +13,7 @@ from kiln_schemas.base import Contract
 from kiln_schemas.errors import Problem
 from kiln_schemas.gates import Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings, Function
-from kiln_schemas.text import Log, Note
+from kiln_schemas.text import Line, Log, Note
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 PATH_LENGTH: Final = 512
@@ -233,12 +233,12 @@ class Progress(Contract):
 
 
 class WorkerRegistration(Contract):
-    name: str = Field(min_length=1, max_length=128)
+    name: Line = Field(min_length=1, max_length=128)
     kinds: tuple[TaskKind, ...] = Field(min_length=1, max_length=32)
     memory_bytes: int = Field(gt=0, lt=2**63)
     threads: int = Field(gt=0, lt=2**31)
-    device: str = Field(max_length=256)
-    version: str = Field(max_length=64)
+    device: Line = Field(max_length=256)
+    version: Line = Field(max_length=64)
 
 
 class WorkerWelcome(Contract):

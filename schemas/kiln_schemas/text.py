@@ -7,10 +7,11 @@ sequence or a change of direction in a name would let it rewrite the sentence ar
 import re
 from typing import Annotated, Final
 
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 UNFIT: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 """Control characters but tab and line feed, line separators, marks of direction, halves of surrogate pairs."""
+LINE_BREAK: Final = re.compile(r"[\t\n]")
 DETAIL_LENGTH: Final = 4000
 PLACE_LENGTH: Final = 300
 NOTE_LENGTH: Final = 500
@@ -22,10 +23,20 @@ def told(text: str, length: int = DETAIL_LENGTH) -> str:
     return UNFIT.sub(lambda match: match[0].encode("unicode_escape").decode(), shown)
 
 
+def check_line(text: str) -> str:
+    """The text unchanged, ValueError where it is not one line fit to be shown as it is."""
+    found = UNFIT.search(text) or LINE_BREAK.search(text)
+    if found:
+        raise ValueError(f"holds the control character U+{ord(found[0]):04X}")
+    return text
+
+
 def _told(length: int) -> BeforeValidator:
     return BeforeValidator(lambda value: told(value, length) if isinstance(value, str) else value)
 
 
+Line = Annotated[str, AfterValidator(check_line)]
+"""A name that a client gives."""
 Told = Annotated[str, _told(DETAIL_LENGTH)]
 """What is told to people."""
 Place = Annotated[str, _told(PLACE_LENGTH)]

@@ -129,6 +129,9 @@ def _job_requests() -> Iterator[Call]:
     yield job("a name of 200 letters", "name", "x" * 200)
     yield job("a name with U+0000", "name", "a\0b", word="U+0000")
     yield job("a label with U+0000", "labels", {"a": "b\0"}, word="U+0000")
+    yield job("a name with an escape sequence", "name", "\x1b[2J\x1b]0;owned\x07", word="U+001B")
+    yield job("a name that is written backwards", "name", "a\u202egpj.exe", word="U+202E")
+    yield job("a label with a line break", "labels", {"a": "b\nc"}, word="U+000A")
     yield job("a name with half a surrogate pair", "name", "\ud800")
     yield job("a field's name with half a surrogate pair", "\ud800", 1, word="d800")
     yield job("a label's key with half a surrogate pair", "labels", {"\ud800": "1"}, word="labels")
@@ -312,10 +315,11 @@ def _workers() -> Iterator[Call]:
         ("threads", 0, "threads"),
         ("device", "x" * 10_000, "device"),
         ("device", "a\0b", "U+0000"),
+        ("name", "\x1b[2J", "U+001B"),
     ):
         body = changed(place, value, WORKER)
         yield posted(f"a worker with {place}={value!r:.20}", "/v1/workers", body, 422, word)
-    other = changed("version", "0\r\n", WORKER)
+    other = changed("version", "0.0.0", WORKER)
     yield posted("a worker of another version", "/v1/workers", other, 409, "version")
     claim = {"kinds": ["prepare"], "wait_s": 0}
     for worker in ("7", "x" * 5000, NOBODY, "null"):
