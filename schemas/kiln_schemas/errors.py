@@ -27,6 +27,7 @@ from typing import ClassVar, Final, Self
 from pydantic import ValidationError
 
 from kiln_schemas.base import Contract
+from kiln_schemas.text import Place, Told
 
 DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """`OSError.errno` of a disk, a quota or a file at its limit; told as MachineLacks wherever files are written."""
@@ -38,12 +39,12 @@ class Problem(Contract):
     type: str = "about:blank"
     title: str
     status: int
-    detail: str
+    detail: Told
     code: str
     """Stable slug for programs: `input`, `fit-failed`, `stale-attempt`, ..."""
-    where: str | None = None
+    where: Place | None = None
     """The mesh, file or field at fault."""
-    remedy: str | None = None
+    remedy: Told | None = None
     """What the user can do about it."""
 
     def sentence(self) -> str:

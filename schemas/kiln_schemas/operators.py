@@ -5,9 +5,10 @@ from enum import StrEnum
 from typing import Annotated, Any, Final, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
 from kiln_schemas.base import Contract
+from kiln_schemas.receivers import check_receiver
 from kiln_schemas.tasks import TaskKind
 
 
@@ -153,7 +154,10 @@ class JobEvent(StrEnum):
 class WebhookRequest(Contract):
     """Body of `POST /v1/webhooks`."""
 
-    url: Annotated[str, Field(pattern=r"^https?://[^\s/@]+(/[^\s]*)?$", max_length=2048)]
+    url: Annotated[
+        str, Field(pattern=r"^https?://[!-.0-?A-~]+(/[!-~]*)?$", max_length=2048), AfterValidator(check_receiver)
+    ]
+    """Without a user or a password; which hosts are refused: `kiln_schemas.receivers`."""
     events: tuple[JobEvent, ...] = Field(
         default=(JobEvent.COMPLETED, JobEvent.GATE_FAILED, JobEvent.FAILED, JobEvent.CANCELED),
         min_length=1,

@@ -40,6 +40,7 @@ def install(app: FastAPI, tokens: TokenBook, limits: Limits) -> None:
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(psycopg.OperationalError, _database_away)
     app.add_exception_handler(PoolTimeout, _database_away)
+    app.add_exception_handler(psycopg.DataError, _not_storable)
     app.add_exception_handler(ClientDisconnect, _gone)
     app.add_middleware(BoundedBody, limit=limits.body_bytes)
     app.add_middleware(Authentication, tokens=tokens)
@@ -64,10 +65,13 @@ async def _invalid_request(_: Request, error: Exception) -> Response:
 
 
 async def _http_error(request: Request, error: Exception) -> Response:
-    """404 and 405 of the router."""
+    """404 and 405 of the router, and bodies that FastAPI could not read."""
     assert isinstance(error, HTTPException)
     if isinstance(error.__cause__, KilnError):  # raised while FastAPI read the body
         return problem_response(error.__cause__.problem())
+    if isinstance(error.__cause__, UnicodeDecodeError | RecursionError | ValueError):
+        why = _UNREADABLE.get(type(error.__cause__), "holds a number that is too long")
+        return problem_response(InputError(f"the JSON {why}", where="body", remedy="Mend the request.").problem())
     about: dict[str, Any] = {"where": f"{request.method} {request.url.path}"}
     match error.status_code:
         case 404:
@@ -86,6 +90,23 @@ async def _database_away(_: Request, error: Exception) -> Response:
     return problem_response(
         Unreachable("the database does not answer", where="database", remedy="Try again in a few seconds.").problem()
     )
+
+
+_UNREADABLE: Final = {UnicodeDecodeError: "is not UTF-8", RecursionError: "nests too deeply"}
+_NOT_STORABLE: Final = {
+    psycopg.DataError: "a text holds the character U+0000",
+    psycopg.errors.UntranslatableCharacter: "a text holds the character U+0000",
+    psycopg.errors.NumericValueOutOfRange: "a number is too large",
+}
+
+
+async def _not_storable(request: Request, error: Exception) -> Response:
+    """What the contracts let pass and the database does not hold; any other error in data is a defect of ours."""
+    what = next((what for kind, what in _NOT_STORABLE.items() if type(error) is kind), None)
+    if what is None:
+        raise error
+    place = f"{request.method} {request.url.path}"
+    return problem_response(InputError(what, where=place, remedy="Leave it out.").problem())
 
 
 async def _gone(_: Request, error: Exception) -> Response:

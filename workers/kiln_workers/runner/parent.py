@@ -128,7 +128,7 @@ class Worker:
         self._current = claim
         self._lines.take()
         self._announce("task.claimed", _names(claim))
-        child.send(Work(claim=claim))
+        child.begin(Work(claim=claim))
         self._settle(claim, self._attend(child, claim, welcome))
         self._current = None
 
@@ -205,7 +205,10 @@ class Worker:
             match answer:
                 case Report(progress=progress):
                     news = True
-                case Done() | Failed() | Ended():
+                case Done() | Failed():
+                    child.hear_out()
+                    return answer
+                case Ended():
                     return answer
                 case Ready():
                     raise InternalError("the child said it is ready twice")
