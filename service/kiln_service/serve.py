@@ -200,6 +200,7 @@ def _config(arguments: argparse.Namespace) -> ServiceConfig:
         "host": arguments.host,
         "port": arguments.port,
         "database": arguments.database,
+        "storage_url": arguments.storage,
         "store_url": arguments.store,
     }
     tree |= {key: value for key, value in flags.items() if value is not None}
@@ -214,7 +215,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--host", help="address to listen on (127.0.0.1)")
     parser.add_argument("--port", type=int, help="port to listen on (8321; 0 takes a free one)")
     parser.add_argument("--database", help="connection string of a PostgreSQL server (default: an embedded one)")
-    parser.add_argument("--store", help="URL of the folder for light-field stores, file:// or s3://")
+    parser.add_argument("--storage", help="URL of the folder for light fields and blobs, file:// or s3:// (--data)")
+    parser.add_argument("--store", help="URL of the folder for light-field stores alone")
     parser.add_argument("--config", type=Path, help="JSON file with everything else (kiln_service.config)")
     parser.add_argument("--json", action="store_true", help="announce readiness as one JSON line")
     parser.add_argument("--log-level", default="info", choices=["debug", "info", "warning", "error"])

@@ -139,15 +139,19 @@ def serve(
     database: Annotated[
         str | None, typer.Option("--database", metavar="DSN", help="PostgreSQL; an embedded one by default.")
     ] = None,
+    storage: Annotated[
+        str | None,
+        typer.Option("--storage", metavar="URL", help="Light fields and blobs: file:// or s3://; --data by default."),
+    ] = None,
     store: Annotated[
-        str | None, typer.Option("--store", metavar="URL", help="Light-field stores: file:// or s3://.")
+        str | None, typer.Option("--store", metavar="URL", help="Light-field stores alone: file:// or s3://.")
     ] = None,
     config: Annotated[Path | None, typer.Option("--config", metavar="FILE", help="JSON with all settings.")] = None,
     json: options.Json = False,
 ) -> None:
     """Run a coordinator."""
     command = ["--host", host, "--port", str(port), "--data", str(data)]
-    for flag, value in (("--database", database), ("--store", store), ("--config", config)):
+    for flag, value in (("--database", database), ("--storage", storage), ("--store", store), ("--config", config)):
         command += [flag, str(value)] if value is not None else []
     become("kiln_service", [*command, *(["--json"] if json else [])])
 
