@@ -8,6 +8,7 @@ configuration, or were made by an operator (`operators.create_token`) and are lo
 import hashlib
 import hmac
 import os
+import re
 import secrets
 import time
 from collections.abc import Sequence
@@ -15,12 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from kiln_schemas.errors import AuthError, Forbidden
+from kiln_schemas.errors import AuthError, Forbidden, InputError
 from kiln_schemas.operators import Scope
 from kiln_service.config import OWN_TOKEN, TokenEntry
 from kiln_service.db import Database
 
 TOKEN_FILE: Final = "token"
+OWNER_VARIABLE: Final = "LIGHTKILN_OWNER_TOKEN"
 MEMORY_S: Final = 2.0
 """A token of the database is remembered for so long: a revoked one is refused after that at the latest."""
 MEMORY_SIZE: Final = 4096
@@ -102,7 +104,16 @@ class TokenBook:
 
 
 def own_token(data: Path) -> TokenEntry:
-    """The token of the data folder, made at the first start (mode 0600), with every scope."""
+    """The owner's token, with every scope: given by OWNER_VARIABLE, else in the data folder, where it is made.
+
+    The file has mode 0600. The variable gives several coordinators the same token.
+    """
+    if given := os.environ.get(OWNER_VARIABLE, ""):
+        if not re.fullmatch(r"[\x21-\x7e]{16,}", given):
+            raise InputError(
+                "the token is refused", where=OWNER_VARIABLE, remedy="Set 16 characters or more, printable, no blanks."
+            )
+        return _owner(given)
     path = data / TOKEN_FILE
     if not path.exists():
         draft = path.with_name(f".{TOKEN_FILE}.{os.getpid()}")
@@ -118,5 +129,9 @@ def own_token(data: Path) -> TokenEntry:
             pass
         finally:
             draft.unlink()
-    digest = hashlib.sha256(path.read_text().strip().encode()).hexdigest()
+    return _owner(path.read_text().strip())
+
+
+def _owner(token: str) -> TokenEntry:
+    digest = hashlib.sha256(token.encode()).hexdigest()
     return TokenEntry(name=OWN_TOKEN, sha256=digest, scopes=(Scope.ADMIN,))

@@ -25,7 +25,7 @@ from fastapi import FastAPI
 
 from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, MachineLacks
 from kiln_service.app import create_app
-from kiln_service.auth import TOKEN_FILE
+from kiln_service.auth import OWNER_VARIABLE, TOKEN_FILE
 from kiln_service.config import ServiceConfig, make_config
 from kiln_service.embedded import EmbeddedPostgres
 
@@ -103,9 +103,11 @@ def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json:
     with _bound(config.host, config.port) as listening:
         host, port = listening.getsockname()[:2]
         url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
-        token_file = str((config.data / TOKEN_FILE).absolute())
+        given = bool(os.environ.get(OWNER_VARIABLE))
+        token_file = None if given else str((config.data / TOKEN_FILE).absolute())
         ready = {"url": url, "token_file": token_file, "data": str(config.data.absolute()), "pid": os.getpid()}
-        announce = json.dumps(ready) if as_json else f"lightkiln serves {url} (token in {token_file})"
+        where = f"given by {OWNER_VARIABLE}" if given else f"in {token_file}"
+        announce = json.dumps(ready) if as_json else f"lightkiln serves {url} (token {where})"
         app = create_app(config)
         server = Server(
             app,
