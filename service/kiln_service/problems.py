@@ -19,6 +19,7 @@ from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, 
 from kiln_service.auth import TokenBook
 from kiln_service.config import Limits
 from kiln_service.ids import new_id
+from kiln_service.requests import Requests
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +35,7 @@ def problem_response(problem: Problem) -> JSONResponse:
 
 
 def install(app: FastAPI, tokens: TokenBook, limits: Limits) -> None:
-    """Handlers for every kind of error, then (outermost last) authentication, body bounds and the last resort."""
+    """Handlers for every kind of error, then (outermost last) body bounds, authentication, last resort, log."""
     app.add_exception_handler(KilnError, _kiln_error)
     app.add_exception_handler(RequestValidationError, _invalid_request)
     app.add_exception_handler(HTTPException, _http_error)
@@ -44,6 +45,7 @@ def install(app: FastAPI, tokens: TokenBook, limits: Limits) -> None:
     app.add_middleware(BoundedBody, limit=limits.body_bytes)
     app.add_middleware(Authentication, tokens=tokens)
     app.add_middleware(LastResort)
+    app.add_middleware(Requests)
 
 
 async def _kiln_error(_: Request, error: Exception) -> Response:

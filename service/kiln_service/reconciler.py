@@ -27,7 +27,8 @@ async def reconcile(database: Database) -> int:
             job, task = await lock_task(tx, row["id"])
             present = (await tx.one("has_queue_job", queue_job=task.queue_job))["present"]
             if task.state is TaskState.QUEUED and job.state is not JobState.PAUSED and not present:
-                log.warning("%s %s was queued without a queue job; deferred again", task.kind, task.label)
+                ids = {"job_id": job.id, "task_id": task.id}
+                log.warning("%s %s was queued without a queue job; deferred again", task.kind, task.label, extra=ids)
                 await queue.defer(tx, job, [(task.id, task.kind)])
                 repaired += 1
     return repaired

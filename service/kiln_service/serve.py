@@ -24,6 +24,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, MachineLacks
+from kiln_schemas.logs import LogFormat, set_up
 from kiln_service.app import create_app
 from kiln_service.auth import OWNER_VARIABLE, TOKEN_FILE
 from kiln_service.config import ServiceConfig, make_config
@@ -79,9 +80,7 @@ class Server(uvicorn.Server):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run; the exit code (errors as in kiln_schemas.errors)."""
     arguments = _parser().parse_args(argv)
-    logging.basicConfig(
-        level=arguments.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr
-    )
+    set_up(LogFormat(arguments.log_format), arguments.log_level)
     try:
         config = _config(arguments)
         _prepare_folder(config.data)
@@ -221,5 +220,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--store", help="URL of the folder for light-field stores alone")
     parser.add_argument("--config", type=Path, help="JSON file with everything else (kiln_service.config)")
     parser.add_argument("--json", action="store_true", help="announce readiness as one JSON line")
+    parser.add_argument("--log-format", default=LogFormat.TEXT.value, choices=[form.value for form in LogFormat])
     parser.add_argument("--log-level", default="info", choices=["debug", "info", "warning", "error"])
     return parser

@@ -38,7 +38,9 @@ def test_a_farm_on_a_bucket(
         farm.stop()
     assert digests(package) == digests(baked)
     data = {path.name for path in (farm.folder / "data").iterdir()}
-    assert data == {"incoming", "lock", "postgres", "postgres.log", "token"}, "nothing else is on the coordinator's disk"
+    assert data == {"incoming", "lock", "postgres", "postgres.log", "token"}, (
+        "nothing else is on the coordinator's disk"
+    )
     assert freed["jobs"][0]["stores"] == [f"{storage}/store/{job}.zarr"] and again["jobs"] == []
     bucket = open_objects(storage)
     left = [entry["path"] for page in obstore.list(bucket) for entry in page]
