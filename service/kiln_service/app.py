@@ -29,6 +29,7 @@ from kiln_service.db import Database
 from kiln_service.db.migrate import migrate
 from kiln_service.events import Signals
 from kiln_service.maintenance import Maintenance
+from kiln_service.metrics import RequestSeconds
 from kiln_service.webhooks import Deliverer
 from kiln_service.work import Work
 
@@ -54,6 +55,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         """This interface, as OpenAPI."""
         return JSONResponse(openapi_document(app))
 
+    app.state.request_seconds = RequestSeconds()
     problems.install(app, TokenBook([own_token(config.data), *config.tokens]), config.limits)
     return app
 

@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 HEADER: Final = "X-Request-Id"
 _PLAIN: Final = re.compile(r"[\w.:-]{1,64}")
 _IDS: Final = re.compile(r"/(job|task|worker)s/([0-9a-f]{32})(?=/|$)")
+_METHODS: Final = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE"})
 _QUIET: Final = frozenset(
     {
         "/healthz",
@@ -58,7 +59,10 @@ class Requests:
             try:
                 await self._app(scope, receive, answered)
             finally:
-                _note(scope, status, time.perf_counter() - began)
+                seconds = time.perf_counter() - began
+                route = route_of(scope)
+                scope["app"].state.request_seconds.observe(_method(scope), route, status, seconds)
+                _note(scope, route, status, seconds)
 
 
 def route_of(scope: Scope) -> str:
@@ -67,8 +71,13 @@ def route_of(scope: Scope) -> str:
     return str(getattr(route, "path", "none"))
 
 
-def _note(scope: Scope, status: int, seconds: float) -> None:
-    route, principal = route_of(scope), scope.get("principal")
+def _method(scope: Scope) -> str:
+    """The method as a label: a client that makes up names must not make up metrics."""
+    return scope["method"] if scope["method"] in _METHODS else "other"
+
+
+def _note(scope: Scope, route: str, status: int, seconds: float) -> None:
+    principal = scope.get("principal")
     level = logging.WARNING if status >= 500 else logging.DEBUG if route in _QUIET and status < 400 else logging.INFO
     log.log(
         level,
