@@ -11,7 +11,7 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -57,8 +57,13 @@ class TokenBook:
         self._entries = tuple(entries)
         self._remembered: dict[str, tuple[Principal, float]] = {}
 
-    async def authenticate(self, header: str | None, database: Database) -> Principal:
-        """The caller with this Authorization header; AuthError where there is none or the token is unknown."""
+    async def authenticate(
+        self, header: str | None, database: Database, before_lookup: Callable[[], None] = lambda: None
+    ) -> Principal:
+        """The caller with this Authorization header; AuthError where there is none or the token is unknown.
+
+        `before_lookup` may refuse by an exception before the database is asked for a token.
+        """
         if not header:
             raise AuthError(
                 "no token was sent",
@@ -74,7 +79,7 @@ class TokenBook:
         bearer = scheme.lower() == "bearer"
         if bearer and found is not None:
             return Principal(found.name, frozenset(found.scopes))
-        stored = await self._stored(digest, database) if bearer else None
+        stored = await self._stored(digest, database, before_lookup) if bearer else None
         if stored is None:
             raise AuthError(
                 "the token is not known here",
@@ -83,13 +88,14 @@ class TokenBook:
             )
         return stored
 
-    async def _stored(self, digest: str, database: Database) -> Principal | None:
+    async def _stored(self, digest: str, database: Database, before_lookup: Callable[[], None]) -> Principal | None:
         """Whose token of the database has this hash, as of MEMORY_S ago or later."""
         now = time.monotonic()
         principal, until = self._remembered.get(digest, (None, 0.0))
         if principal is not None and now < until:
             return principal
         self._remembered.pop(digest, None)
+        before_lookup()
         async with database.transaction() as tx:
             row = await tx.maybe("find_token", sha256=digest)
             if row is None:

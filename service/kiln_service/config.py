@@ -26,6 +26,26 @@ class TokenEntry(Contract):
     scopes: tuple[Scope, ...] = Field(min_length=1)
 
 
+class Rate(Contract):
+    """A token bucket (`kiln_service.rates`)."""
+
+    per_s: float = Field(gt=0)
+    """Requests a second in the long run."""
+    burst: int = Field(ge=1)
+    """Requests at once."""
+
+
+class Rates(Contract):
+    """How often one caller may ask."""
+
+    clients: Rate = Rate(per_s=200, burst=2000)
+    """A token, on all routes but those of workers."""
+    workers: Rate = Rate(per_s=5000, burst=20000)
+    """A token on the routes of workers, tasks and blobs: a whole farm may share it."""
+    failures: Rate = Rate(per_s=5, burst=1000)
+    """An address that fails to sign in."""
+
+
 class Limits(Contract):
     """Bounds that keep one client from exhausting the coordinator."""
 
@@ -39,6 +59,8 @@ class Limits(Contract):
     """Most jobs on a page."""
     tiles: int = Field(default=65536, gt=0)
     """Most render tiles of a job, and most blocks to refine."""
+    rates: Rates = Rates()
+    """How often one caller may ask."""
 
 
 class Timing(Contract):

@@ -72,6 +72,7 @@ _MEANINGS: Final = {
     404: "Not there",
     409: "The request contradicts the present state",
     413: "Too large",
+    429: "Asked too often; Retry-After says how long to wait",
     416: "The range is not in the file",
     422: "The input is not usable",
     507: "No space",
@@ -85,7 +86,7 @@ def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
             "description": _MEANINGS[code],
             "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
         }
-        for code in sorted({401, 403, *codes})
+        for code in sorted({401, 403, 429, *codes})
     }
 
 
