@@ -16,7 +16,7 @@ from urllib.parse import quote
 import httpx
 from pydantic import TypeAdapter
 
-from kiln_schemas.errors import AuthError, Unreachable, error_of_answer
+from kiln_schemas.errors import AuthError, KilnError, TooMany, Unreachable, error_of_answer, wait_asked
 from kiln_schemas.job import (
     JobChange,
     JobPage,
@@ -46,7 +46,8 @@ from kiln_schemas.tasks import Artifact, TaskKind
 
 CHUNK: Final = 1 << 20
 PAUSE_S: Final = (0.1, 2.0)
-AWAY: Final = frozenset({502, 503, 504})
+AWAY: Final = frozenset({TooMany.status, 502, 503, 504})
+"""Statuses of an answer after which the call is repeated, not before its Retry-After."""
 MISSING_AT_ONCE: Final = 4096
 OnBytes = Callable[[int], None]
 
@@ -260,6 +261,7 @@ class Client:
         """The first answer that is not an outage; the coordinator's errors are raised."""
         deadline, pause = time.monotonic() + self._patience_s, PAUSE_S[0]
         while True:
+            response: httpx.Response | None = None
             try:
                 response = attempt()
             except httpx.UnsupportedProtocol as error:
@@ -272,10 +274,12 @@ class Client:
                 if response.is_success:
                     return response
                 if response.status_code not in AWAY:
-                    asked = f"{response.request.method} {response.request.url.path}"
-                    raise error_of_answer(response.content, response.status_code, asked, self.url)
+                    raise self._error(response)
                 reason = f"it answers {response.status_code}"
+                pause = max(pause, wait_asked(response.headers.get("retry-after")))
             if time.monotonic() + pause > deadline:
+                if response is not None and response.status_code == TooMany.status:
+                    raise self._error(response)
                 raise Unreachable(
                     f"the coordinator does not answer ({reason})",
                     where=self.url,
@@ -283,6 +287,10 @@ class Client:
                 )
             time.sleep(pause)
             pause = min(2 * pause, PAUSE_S[1])
+
+    def _error(self, response: httpx.Response) -> KilnError:
+        asked = f"{response.request.method} {response.request.url.path}"
+        return error_of_answer(response.content, response.status_code, asked, self.url)
 
 
 def _pieces(path: Path, on_bytes: OnBytes) -> Iterator[bytes]:

@@ -29,6 +29,7 @@ from kiln_service.db import Database
 from kiln_service.db.migrate import migrate
 from kiln_service.events import Signals
 from kiln_service.maintenance import Maintenance
+from kiln_service.metrics import RequestSeconds
 from kiln_service.webhooks import Deliverer
 from kiln_service.work import Work
 
@@ -54,6 +55,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         """This interface, as OpenAPI."""
         return JSONResponse(openapi_document(app))
 
+    app.state.request_seconds = RequestSeconds()
     problems.install(app, TokenBook([own_token(config.data), *config.tokens]), config.limits)
     return app
 
@@ -72,7 +74,7 @@ def openapi_document(app: FastAPI) -> dict[str, object]:
             if "requestBody" in operation:
                 codes |= {413, 422}
             if "security" in operation:
-                codes |= {401, 403, 503}
+                codes |= {401, 403, 429, 503}
             documented = {str(code): answer for code, answer in problem_answers(*codes).items()}
             operation["responses"] = dict(sorted((answers | documented).items()))
     return document

@@ -8,19 +8,21 @@ configuration, or were made by an operator (`operators.create_token`) and are lo
 import hashlib
 import hmac
 import os
+import re
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from kiln_schemas.errors import AuthError, Forbidden
+from kiln_schemas.errors import AuthError, Forbidden, InputError
 from kiln_schemas.operators import Scope
 from kiln_service.config import OWN_TOKEN, TokenEntry
 from kiln_service.db import Database
 
 TOKEN_FILE: Final = "token"
+OWNER_VARIABLE: Final = "LIGHTKILN_OWNER_TOKEN"
 MEMORY_S: Final = 2.0
 """A token of the database is remembered for so long: a revoked one is refused after that at the latest."""
 MEMORY_SIZE: Final = 4096
@@ -55,8 +57,13 @@ class TokenBook:
         self._entries = tuple(entries)
         self._remembered: dict[str, tuple[Principal, float]] = {}
 
-    async def authenticate(self, header: str | None, database: Database) -> Principal:
-        """The caller with this Authorization header; AuthError where there is none or the token is unknown."""
+    async def authenticate(
+        self, header: str | None, database: Database, before_lookup: Callable[[], None] = lambda: None
+    ) -> Principal:
+        """The caller with this Authorization header; AuthError where there is none or the token is unknown.
+
+        `before_lookup` may refuse by an exception before the database is asked for a token.
+        """
         if not header:
             raise AuthError(
                 "no token was sent",
@@ -72,7 +79,7 @@ class TokenBook:
         bearer = scheme.lower() == "bearer"
         if bearer and found is not None:
             return Principal(found.name, frozenset(found.scopes))
-        stored = await self._stored(digest, database) if bearer else None
+        stored = await self._stored(digest, database, before_lookup) if bearer else None
         if stored is None:
             raise AuthError(
                 "the token is not known here",
@@ -81,13 +88,14 @@ class TokenBook:
             )
         return stored
 
-    async def _stored(self, digest: str, database: Database) -> Principal | None:
+    async def _stored(self, digest: str, database: Database, before_lookup: Callable[[], None]) -> Principal | None:
         """Whose token of the database has this hash, as of MEMORY_S ago or later."""
         now = time.monotonic()
         principal, until = self._remembered.get(digest, (None, 0.0))
         if principal is not None and now < until:
             return principal
         self._remembered.pop(digest, None)
+        before_lookup()
         async with database.transaction() as tx:
             row = await tx.maybe("find_token", sha256=digest)
             if row is None:
@@ -102,7 +110,16 @@ class TokenBook:
 
 
 def own_token(data: Path) -> TokenEntry:
-    """The token of the data folder, made at the first start (mode 0600), with every scope."""
+    """The owner's token, with every scope: given by OWNER_VARIABLE, else in the data folder, where it is made.
+
+    The file has mode 0600. The variable gives several coordinators the same token.
+    """
+    if given := os.environ.get(OWNER_VARIABLE, ""):
+        if not re.fullmatch(r"[\x21-\x7e]{16,}", given):
+            raise InputError(
+                "the token is refused", where=OWNER_VARIABLE, remedy="Set 16 characters or more, printable, no blanks."
+            )
+        return _owner(given)
     path = data / TOKEN_FILE
     if not path.exists():
         draft = path.with_name(f".{TOKEN_FILE}.{os.getpid()}")
@@ -118,5 +135,9 @@ def own_token(data: Path) -> TokenEntry:
             pass
         finally:
             draft.unlink()
-    digest = hashlib.sha256(path.read_text().strip().encode()).hexdigest()
+    return _owner(path.read_text().strip())
+
+
+def _owner(token: str) -> TokenEntry:
+    digest = hashlib.sha256(token.encode()).hexdigest()
     return TokenEntry(name=OWN_TOKEN, sha256=digest, scopes=(Scope.ADMIN,))

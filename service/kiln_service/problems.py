@@ -15,10 +15,23 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, NotFound, Problem, TooLarge, Unreachable
-from kiln_service.auth import TokenBook
+from kiln_schemas.errors import (
+    AuthError,
+    Conflict,
+    InputError,
+    InternalError,
+    KilnError,
+    NotFound,
+    Problem,
+    TooLarge,
+    TooMany,
+    Unreachable,
+)
+from kiln_service.auth import Principal, TokenBook
 from kiln_service.config import Limits
 from kiln_service.ids import new_id
+from kiln_service.rates import RateLimits
+from kiln_service.requests import Requests
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +47,7 @@ def problem_response(problem: Problem) -> JSONResponse:
 
 
 def install(app: FastAPI, tokens: TokenBook, limits: Limits) -> None:
-    """Handlers for every kind of error, then (outermost last) authentication, body bounds and the last resort."""
+    """Handlers for every kind of error, then (outermost last) body bounds, authentication, last resort, log."""
     app.add_exception_handler(KilnError, _kiln_error)
     app.add_exception_handler(RequestValidationError, _invalid_request)
     app.add_exception_handler(HTTPException, _http_error)
@@ -43,8 +56,9 @@ def install(app: FastAPI, tokens: TokenBook, limits: Limits) -> None:
     app.add_exception_handler(psycopg.DataError, _not_storable)
     app.add_exception_handler(ClientDisconnect, _gone)
     app.add_middleware(BoundedBody, limit=limits.body_bytes)
-    app.add_middleware(Authentication, tokens=tokens)
+    app.add_middleware(Authentication, tokens=tokens, rates=RateLimits(limits.rates))
     app.add_middleware(LastResort)
+    app.add_middleware(Requests)
 
 
 async def _kiln_error(_: Request, error: Exception) -> Response:
@@ -147,24 +161,39 @@ class LastResort:
 class Authentication:
     """Refuse requests without a valid token before their body is read; `scope["principal"]` is who calls."""
 
-    def __init__(self, app: ASGIApp, tokens: TokenBook) -> None:
-        self._app, self._tokens = app, tokens
+    def __init__(self, app: ASGIApp, tokens: TokenBook, rates: RateLimits) -> None:
+        self._app, self._tokens, self._rates = app, tokens, rates
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http" and scope["path"] not in OPEN_PATHS:
-            header = next((value for key, value in scope["headers"] if key == b"authorization"), None)
             try:
-                database = scope["app"].state.parts.database
-                scope["principal"] = await self._tokens.authenticate(
-                    header.decode("latin-1") if header else None, database
-                )
+                scope["principal"] = await self._caller(scope)
+                self._rates.count(scope["principal"].name, scope["path"])
             except KilnError as error:
-                await problem_response(error.problem())(scope, receive, send)
+                response = problem_response(error.problem())
+                if isinstance(error, TooMany):
+                    response.headers["Retry-After"] = str(error.wait_s)
+                await response(scope, receive, send)
                 return
             except (psycopg.OperationalError, PoolTimeout) as error:
                 await (await _database_away(Request(scope), error))(scope, receive, send)
                 return
         await self._app(scope, receive, send)
+
+    async def _caller(self, scope: Scope) -> Principal:
+        """Who calls; an address that failed too often is refused before a token is looked up in the database."""
+        header = next((value for key, value in scope["headers"] if key == b"authorization"), None)
+        address = scope["client"][0] if scope.get("client") else ""
+        database = scope["app"].state.parts.database
+        try:
+            return await self._tokens.authenticate(
+                header.decode("latin-1") if header else None,
+                database,
+                before_lookup=lambda: self._rates.may_sign_in(address),
+            )
+        except AuthError:
+            self._rates.failed(address)
+            raise
 
 
 class BoundedBody:

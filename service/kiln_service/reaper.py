@@ -33,7 +33,8 @@ async def _reap_one(database: Database, work: Work, task_id: str, stale_s: float
         still = await tx.one("task_is_stale", id=task_id, seconds=stale_s)
         if task.state is not TaskState.ACTIVE or not still["stale"]:
             return 0
-        log.warning("%s %s of job %s: no heartbeat for %.0f s", task.kind, task.label, job.id, stale_s)
+        ids = {"job_id": job.id, "task_id": task.id, "worker_id": task.worker_id}
+        log.warning("%s %s: no heartbeat for %.0f s", task.kind, task.label, stale_s, extra=ids)
         await work.end_attempt(
             tx,
             job,

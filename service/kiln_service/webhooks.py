@@ -108,7 +108,13 @@ class Deliverer:
         outcome = "delivered" if told else "failed" if last else "pending"
         pause = min(LONGEST_PAUSE_S, self._timing.maintenance_s * 2 ** row["attempts"])
         if not told:
-            log.warning("webhook %s: attempt %d failed: %s", row["url"], row["attempts"], error or f"status {status}")
+            log.warning(
+                "webhook %s: attempt %d failed: %s",
+                row["url"],
+                row["attempts"],
+                error or f"status {status}",
+                extra={"job_id": row["job_id"]},
+            )
         async with self._database.transaction() as tx:
             await tx.run("end_delivery", id=row["id"], outcome=outcome, status=status, error=error, pause_s=pause)
 

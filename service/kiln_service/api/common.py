@@ -74,6 +74,7 @@ _MEANINGS: Final = {
     413: "Too large",
     416: "The range is not in the file",
     422: "The input is not usable",
+    429: "Asked too often; Retry-After says how long to wait",
     503: "The database does not answer",
     507: "No space",
 }
@@ -81,7 +82,7 @@ _MEANINGS: Final = {
 
 def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
     """OpenAPI responses of a route: problem documents with these codes, and those for want of a token or a scope."""
-    return problem_answers(401, 403, *codes)
+    return problem_answers(401, 403, 429, *codes)
 
 
 def problem_answers(*codes: int) -> dict[int | str, dict[str, Any]]:

@@ -42,7 +42,7 @@ def matches(header: str | None, etag: str) -> bool:
     return etag in names or names == ["*"]
 
 
-def serve_blob(request: Request, blobs: Blobs, sha256: str, size: int, media_type: str) -> Response:
+async def serve_blob(request: Request, blobs: Blobs, sha256: str, size: int, media_type: str) -> Response:
     """The answer to GET or HEAD of a blob."""
     etag = f'"{sha256}"'
     headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": "private, no-cache"} | INERT
@@ -63,6 +63,5 @@ def serve_blob(request: Request, blobs: Blobs, sha256: str, size: int, media_typ
         headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
     if request.method == "HEAD":
         return Response(headers=headers, media_type=media_type)
-    return StreamingResponse(
-        blobs.read(sha256, start, end), status_code=206 if part else 200, headers=headers, media_type=media_type
-    )
+    pieces = await blobs.read(sha256, start, end)
+    return StreamingResponse(pieces, status_code=206 if part else 200, headers=headers, media_type=media_type)

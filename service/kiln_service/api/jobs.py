@@ -208,7 +208,7 @@ _ARTIFACT: Final[dict[str, Any]] = {
 async def artifact(job_id: str, name: str, request: Request, parts: PartsHere) -> Response:
     """Download an artifact, whole or a range of it."""
     found = await views.artifact(parts.database, job_id, name)
-    return serve_blob(request, parts.blobs, found.sha256, found.size, found.media_type)
+    return await serve_blob(request, parts.blobs, found.sha256, found.size, found.media_type)
 
 
 def _event_id(header: str | None) -> int:

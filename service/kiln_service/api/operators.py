@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Path, Query, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from kiln_schemas.operators import (
     AuditEntry,
@@ -129,6 +129,7 @@ async def collect_garbage(request: GcRequest, parts: PartsHere, who: Admin) -> G
     response_class=Response,
     responses=problems() | {200: {"description": "In Prometheus' text format", "content": {"text/plain": {}}}},
 )
-async def prometheus(parts: PartsHere) -> Response:
-    """Queue, tasks, workers and storage for Prometheus."""
-    return Response(await metrics.text(parts.database), media_type=metrics.MEDIA_TYPE)
+async def prometheus(parts: PartsHere, request: Request) -> Response:
+    """Queue, tasks, workers, storage and this coordinator's requests for Prometheus."""
+    own: metrics.RequestSeconds = request.app.state.request_seconds
+    return Response(await metrics.text(parts.database) + own.text(), media_type=metrics.MEDIA_TYPE)

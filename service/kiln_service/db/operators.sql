@@ -81,12 +81,26 @@ SELECT kind, state, count(*) AS tasks FROM tasks GROUP BY kind, state;
 -- Jobs by state.
 SELECT state, count(*) AS jobs FROM jobs GROUP BY state;
 
--- name: sum_seconds
--- Busy seconds and number of completed attempts by kind.
-SELECT kind, count(*) AS tasks, COALESCE(sum((result ->> 'seconds')::float8), 0) AS seconds,
-       COALESCE(sum((result ->> 'paths')::float8), 0) AS paths,
+-- name: sum_work
+-- Completed attempts by kind, and what tiles rendered.
+SELECT kind, count(*) AS tasks, COALESCE(sum((result ->> 'paths')::float8), 0) AS paths,
        COALESCE(sum((spec -> 'tile' ->> 'texels')::float8), 0) AS texels
 FROM tasks WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind;
+
+-- name: seconds_of_tasks
+-- Completed attempts by kind and by the number of the bounds, in seconds, that each took longer than.
+SELECT kind, width_bucket((result ->> 'seconds')::float8, %(bounds)s::float8[]) AS bucket, count(*) AS tasks,
+       sum((result ->> 'seconds')::float8) AS seconds
+FROM tasks WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind, bucket;
+
+-- name: sum_light_fields
+-- Bytes of radiance (three halves a pixel) in stores that are not freed, each counted once.
+SELECT COALESCE(sum((tasks.spec -> 'tile' ->> 'texels')::bigint * readers.pixels * 6), 0)::bigint AS bytes
+FROM (
+    SELECT DISTINCT ON (store_url) id, ((settings -> 'render' ->> 'image_size')::bigint) ^ 2 AS pixels
+    FROM jobs WHERE freed IS NULL ORDER BY store_url, id
+) AS readers
+JOIN tasks ON tasks.job_id = readers.id AND tasks.kind = 'render' AND tasks.state = 'completed';
 
 -- name: count_events
 -- Events of tasks by kind.

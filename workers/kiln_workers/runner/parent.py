@@ -284,7 +284,8 @@ class Worker:
 
     def _hear_line(self, line: str) -> None:
         self._lines.add(line)
-        self._announce("log", {"line": line})
+        current = self._current
+        self._announce("log", {"line": line} | (_names(current) if current else {}))
 
     def _interrupt(self, signum: int, frame: FrameType | None) -> None:
         if not self._closing:
