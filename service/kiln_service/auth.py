@@ -64,22 +64,24 @@ class TokenBook:
                 remedy="Send `Authorization: Bearer TOKEN` (by default it is in the data folder's file `token`).",
             )
         scheme, _, token = header.partition(" ")
-        digest = hashlib.sha256(token.strip().encode()).hexdigest()
-        found: TokenEntry | None = None
-        for entry in self._entries:  # all of them, so that the time tells nothing
-            if hmac.compare_digest(entry.sha256, digest):
-                found = entry
-        bearer = scheme.lower() == "bearer"
-        if bearer and found is not None:
-            return Principal(found.name, frozenset(found.scopes))
-        stored = await self._stored(digest, database) if bearer else None
-        if stored is None:
+        principal = await self.find(digest_of(token.strip()), database) if scheme.lower() == "bearer" else None
+        if principal is None:
             raise AuthError(
                 "the token is not known here",
                 where="Authorization",
                 remedy="Check the token and the coordinator's URL.",
             )
-        return stored
+        return principal
+
+    async def find(self, digest: str, database: Database) -> Principal | None:
+        """Whose token has this sha256."""
+        found: TokenEntry | None = None
+        for entry in self._entries:  # all of them, so that the time tells nothing
+            if hmac.compare_digest(entry.sha256, digest):
+                found = entry
+        if found is not None:
+            return Principal(found.name, frozenset(found.scopes))
+        return await self._stored(digest, database)
 
     async def _stored(self, digest: str, database: Database) -> Principal | None:
         """Whose token of the database has this hash, as of MEMORY_S ago or later."""
@@ -101,6 +103,11 @@ class TokenBook:
         return principal
 
 
+def digest_of(secret: str) -> str:
+    """What is kept of a token or cookie: its sha256."""
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
 def own_token(data: Path) -> TokenEntry:
     """The token of the data folder, made at the first start (mode 0600), with every scope."""
     path = data / TOKEN_FILE
@@ -118,5 +125,4 @@ def own_token(data: Path) -> TokenEntry:
             pass
         finally:
             draft.unlink()
-    digest = hashlib.sha256(path.read_text().strip().encode()).hexdigest()
-    return TokenEntry(name=OWN_TOKEN, sha256=digest, scopes=(Scope.ADMIN,))
+    return TokenEntry(name=OWN_TOKEN, sha256=digest_of(path.read_text().strip()), scopes=(Scope.ADMIN,))

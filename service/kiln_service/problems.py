@@ -4,27 +4,65 @@ Pure ASGI middleware, so that streamed bodies pass through untouched.
 """
 
 import logging
+from collections.abc import Mapping
 from typing import Any, Final
+from urllib.parse import quote
 
 import psycopg
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import JSONResponse, RedirectResponse, Response
 from psycopg_pool import PoolTimeout
+from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, NotFound, Problem, TooLarge, Unreachable
-from kiln_service.auth import TokenBook
+from kiln_schemas.errors import (
+    AuthError,
+    Conflict,
+    InputError,
+    InternalError,
+    KilnError,
+    NotFound,
+    Problem,
+    TooLarge,
+    Unreachable,
+)
+from kiln_service import sessions
+from kiln_service.auth import Principal, TokenBook
 from kiln_service.config import Limits
 from kiln_service.ids import new_id
 
 log = logging.getLogger(__name__)
 
 MEDIA_TYPE: Final = "application/problem+json"
-OPEN_PATHS: Final = frozenset({"/healthz", "/readyz"})
+OPEN_PATHS: Final = frozenset({"/healthz", "/readyz", "/login"})
+OPEN_FOLDER: Final = "/static/"
 """What needs no token."""
+SECURITY_HEADERS: Final[Mapping[str, str]] = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+API_POLICY: Final = "sandbox; default-src 'none'; img-src data:; style-src 'unsafe-inline'; frame-ancestors 'self'"
+"""Content-Security-Policy under /v1: a package's report may be looked at, but nothing in it runs or loads anything."""
+PAGE_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "frame-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+"""The same for pages; a page that needs more sets its own."""
+
+
+def is_page(path: str) -> bool:
+    """Whether people look at it; everything for programs is under /v1."""
+    return not path.startswith("/v1/")
+
+
+def is_open(path: str) -> bool:
+    """Whether it needs no token."""
+    return path in OPEN_PATHS or path.startswith(OPEN_FOLDER)
 
 
 def problem_response(problem: Problem) -> JSONResponse:
@@ -44,6 +82,7 @@ def install(app: FastAPI, tokens: TokenBook, limits: Limits) -> None:
     app.add_middleware(BoundedBody, limit=limits.body_bytes)
     app.add_middleware(Authentication, tokens=tokens)
     app.add_middleware(LastResort)
+    app.add_middleware(SecurityHeaders)
 
 
 async def _kiln_error(_: Request, error: Exception) -> Response:
@@ -54,13 +93,18 @@ async def _kiln_error(_: Request, error: Exception) -> Response:
 async def _invalid_request(_: Request, error: Exception) -> Response:
     """422 that names the field, its value and what is wrong with it."""
     assert isinstance(error, RequestValidationError)
+    return problem_response(problem_of_request(error))
+
+
+def problem_of_request(error: RequestValidationError) -> Problem:
+    """The same as a problem document."""
     first = error.errors()[0]
     place = [str(part) for part in first["loc"]]
     where = ".".join(place[1:] if len(place) > 1 and place[0] == "body" else place)
     value = repr(first.get("input"))
     shown = value if len(value) <= 200 else f"{value[:200]}…"
     more = f" ({len(error.errors())} faults in all)" if len(error.errors()) > 1 else ""
-    return problem_response(InputError(f"{shown} is refused: {first['msg']}{more}", where=where).problem())
+    return InputError(f"{shown} is refused: {first['msg']}{more}", where=where).problem()
 
 
 async def _http_error(request: Request, error: Exception) -> Response:
@@ -91,6 +135,24 @@ async def _database_away(_: Request, error: Exception) -> Response:
 async def _gone(_: Request, error: Exception) -> Response:
     """The client left in the middle of its body; nobody reads this answer."""
     return problem_response(InputError("the connection closed before the body was whole").problem())
+
+
+class SecurityHeaders:
+    """Tell browsers to guess, run and load nothing that is not meant to be."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                policy = PAGE_POLICY if is_page(scope["path"]) else API_POLICY
+                for name, value in {**SECURITY_HEADERS, "Content-Security-Policy": policy}.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        await self._app(scope, receive, with_headers if scope["type"] == "http" else send)
 
 
 class LastResort:
@@ -124,26 +186,53 @@ class LastResort:
 
 
 class Authentication:
-    """Refuse requests without a valid token before their body is read; `scope["principal"]` is who calls."""
+    """Refuse requests without a valid token or session before their body is read; `scope["principal"]` is who calls.
+
+    `scope["session"]` is the cookie's value where the caller is known by it.
+    """
 
     def __init__(self, app: ASGIApp, tokens: TokenBook) -> None:
         self._app, self._tokens = app, tokens
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and scope["path"] not in OPEN_PATHS:
-            header = next((value for key, value in scope["headers"] if key == b"authorization"), None)
+        if scope["type"] == "http" and not is_open(scope["path"]):
+            request = Request(scope)
             try:
-                database = scope["app"].state.parts.database
-                scope["principal"] = await self._tokens.authenticate(
-                    header.decode("latin-1") if header else None, database
-                )
+                scope["principal"] = await self._who(request)
+            except AuthError as error:
+                response = _sign_in_first(request) or problem_response(error.problem())
+                await response(scope, receive, send)
+                return
             except KilnError as error:
                 await problem_response(error.problem())(scope, receive, send)
                 return
             except (psycopg.OperationalError, PoolTimeout) as error:
-                await (await _database_away(Request(scope), error))(scope, receive, send)
+                await (await _database_away(request, error))(scope, receive, send)
                 return
         await self._app(scope, receive, send)
+
+    async def _who(self, request: Request) -> Principal:
+        """The caller by bearer token or, on pages and where nothing is changed, by the cookie of a session."""
+        database, header = request.app.state.parts.database, request.headers.get("authorization")
+        cookie = sessions.read_cookie(request.headers)
+        safe = request.method in sessions.SAFE_METHODS
+        if header is not None or cookie is None or not (safe or is_page(request.url.path)):
+            return await self._tokens.authenticate(header, database)
+        if not safe:
+            sessions.check_origin(request.headers)
+        request.scope["session"] = cookie
+        return await sessions.principal_of(database, self._tokens, cookie)
+
+
+def _sign_in_first(request: Request) -> Response | None:
+    """Where a browser that shows a page goes to sign in; None where a program has called."""
+    if not is_page(request.url.path) or "text/html" not in request.headers.get("accept", ""):
+        return None
+    if "hx-request" in request.headers:  # a page that is open already: reload it, which leads here again
+        return Response(status_code=204, headers={"HX-Refresh": "true"})
+    shown = request.url.path + (f"?{request.url.query}" if request.url.query else "")
+    target = f"/login?next={quote(shown, safe='')}" if request.method == "GET" else "/login"
+    return RedirectResponse(target, 303)
 
 
 class BoundedBody:

@@ -1,0 +1,21 @@
+"""The dashboard: HTML pages for people, rendered here, kept fresh by htmx; nothing comes from another host.
+
+`pages` has what every page shares; the other modules have the routes. Pages call the same functions as the routes under
+/v1, so a person may do exactly what the token that they signed in with may do.
+"""
+
+from importlib import resources
+
+from fastapi import FastAPI
+from fastapi.staticfiles import StaticFiles
+
+from kiln_service.dashboard import jobs, sign_in
+
+
+def install(app: FastAPI) -> None:
+    """Add the pages, their scripts and the vendored ones."""
+    for module in (sign_in, jobs):
+        app.include_router(module.router)
+    folder = resources.files(__package__)
+    app.mount("/static/vendor", StaticFiles(directory=str(folder / "vendor")), name="vendor")
+    app.mount("/static", StaticFiles(directory=str(folder / "static")), name="static")
