@@ -126,6 +126,8 @@ class Work:
                 attempt=beat.attempt,
                 progress=Jsonb(beat.progress.model_dump(mode="json")) if beat.progress else None,
             )
+            if row is not None and beat.progress is not None and beat.progress.loss is not None:
+                await tx.run("add_loss", task_id=beat.task_id, step=beat.progress.done, loss=beat.progress.loss)
         if row is None:
             return HeartbeatReply(stop=True, reason="the task was given to another attempt or is over")
         state = JobState(row["job_state"])

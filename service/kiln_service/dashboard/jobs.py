@@ -76,20 +76,21 @@ def _read_search(q: str) -> tuple[dict[str, str], str]:
 def bar(stages: Sequence[StageView]) -> list[Part]:
     """A progress bar: one stretch a stage, of the same width each, filled by states."""
     known = {stage.kind: stage for stage in stages}
-    parts = []
-    for place, kind in enumerate(TaskKind):
-        stage, start = known.get(kind), place * WIDTH
-        if stage is None:
-            continue
-        running = max(stage.fraction - stage.completed / stage.total, 0.0)
-        for state, share in (
-            ("completed", stage.completed / stage.total),
-            ("active", running),
-            ("failed", stage.failed / stage.total),
-        ):
-            if share > 0:
-                parts.append(Part(state, start, share * WIDTH))
-                start += share * WIDTH
+    return [part for place, kind in enumerate(TaskKind) if kind in known for part in stretch(known[kind], place)]
+
+
+def stretch(stage: StageView, place: int = 0) -> list[Part]:
+    """The stretch of one stage."""
+    shares = {
+        "completed": stage.completed / stage.total,
+        "active": max(stage.fraction - stage.completed / stage.total, 0.0),
+        "failed": stage.failed / stage.total,
+    }
+    parts, start = [], place * WIDTH
+    for state, share in shares.items():
+        if share > 0:
+            parts.append(Part(state, start, share * WIDTH))
+            start += share * WIDTH
     return parts
 
 

@@ -129,6 +129,17 @@ def _ago(at: datetime | None) -> str:
     return "just now" if seconds < 5 else f"{_duration(seconds).split(' ')[0]} {_duration(seconds).split(' ')[1]} ago"
 
 
+def _told(value: object) -> str:
+    """What an event tells, in few words."""
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    if isinstance(value, dict):
+        return str(value.get("detail") or ", ".join(f"{key} {_told(part)}" for key, part in value.items()))
+    if isinstance(value, list):
+        return "; ".join(_told(part) for part in value[:4]) + (" …" if len(value) > 4 else "")
+    return "–" if value is None else str(value)
+
+
 def _with_query(query: str, **changes: str | None) -> str:
     """A query string with fields replaced, or left out where None."""
     fields = {key: values for key, values in parse_qs(query).items() if key not in changes}
@@ -143,5 +154,5 @@ _templates = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_templates.filters |= {"duration": _duration, "bytes": _bytes, "ago": _ago}
+_templates.filters |= {"duration": _duration, "bytes": _bytes, "ago": _ago, "told": _told}
 _templates.globals |= {"with_query": _with_query}
