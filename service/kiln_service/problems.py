@@ -40,6 +40,9 @@ MEDIA_TYPE: Final = "application/problem+json"
 OPEN_PATHS: Final = frozenset({"/healthz", "/readyz", "/login"})
 OPEN_FOLDER: Final = "/static/"
 """What needs no token."""
+UPLOAD_PATH: Final = "/submit/files"
+UPLOADS: Final = ("/v1/blobs/", UPLOAD_PATH)
+"""Whose PUT is bounded by the size of blobs."""
 SECURITY_HEADERS: Final[Mapping[str, str]] = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "same-origin",
@@ -242,7 +245,7 @@ class BoundedBody:
         self._app, self._limit = app, limit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or (scope["method"] == "PUT" and scope["path"].startswith("/v1/blobs/")):
+        if scope["type"] != "http" or (scope["method"] == "PUT" and scope["path"].startswith(UPLOADS)):
             await self._app(scope, receive, send)
             return
         received = 0

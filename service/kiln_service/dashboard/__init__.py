@@ -9,12 +9,12 @@ from importlib import resources
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 
-from kiln_service.dashboard import atlas, job, jobs, sign_in
+from kiln_service.dashboard import atlas, job, jobs, sign_in, submit, workers
 
 
 def install(app: FastAPI) -> None:
     """Add the pages, their scripts and the vendored ones."""
-    for module in (sign_in, jobs, job, atlas):
+    for module in (sign_in, jobs, job, atlas, submit, workers):
         app.include_router(module.router)
     folder = resources.files(__package__)
     app.mount("/static/vendor", StaticFiles(directory=str(folder / "vendor")), name="vendor")
