@@ -13,8 +13,8 @@ from kiln_service.dashboard.pages import Form, PageRoute, page, see
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 
-SILENT_BEATS: Final = 3.0
-"""A running task is shown as stuck after so many missing heartbeats,"""
+SILENT_SHARE: Final = 0.5
+"""A running task is shown as stuck at this share of the silence after which it is given to another worker,"""
 TIMES: Final = 4.0
 """or when it takes so many times the median of its kind in its job,"""
 LEAST_S: Final = 60.0
@@ -28,7 +28,7 @@ async def workers(request: Request, parts: PartsHere) -> Response:
     async with parts.database.transaction() as tx:
         speed = {row["worker_id"]: row for row in await tx.all("throughput")}
         stuck = await tx.all(
-            "stuck_tasks", silent_s=SILENT_BEATS * parts.config.timing.heartbeat_s, times=TIMES, least_s=LEAST_S
+            "stuck_tasks", silent_s=SILENT_SHARE * parts.config.timing.stale_s, times=TIMES, least_s=LEAST_S
         )
     return page(request, "workers.html", workers=found, speed=speed, stuck=stuck, times=TIMES)
 

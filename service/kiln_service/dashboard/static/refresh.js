@@ -15,7 +15,13 @@ setInterval(() => {
   }
 }, 250);
 
-// What a swap would put in place of the page's part when the coordinator is away or refuses: nothing; say so instead.
+// A search as one types: the address tells it, so that a reload or a bookmark does not lose it.
+document.addEventListener("htmx:after:request", (event) => {
+  const form = event.target.closest?.("form.search");
+  if (form) history.replaceState(null, "", `${form.action}?${new URLSearchParams(new FormData(form))}`);
+});
+
+// Nothing is put in place of the page when the coordinator is away or refuses (see htmx-config); say so instead.
 document.addEventListener("htmx:after:request", (event) => {
   const status = event.detail?.ctx?.response?.raw?.status ?? 0;
   document.body.classList.toggle("stale", status === 0 || status >= 400);
