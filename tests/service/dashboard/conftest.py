@@ -90,10 +90,14 @@ def axe(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Page], list[str]]
 
     def check(page: Page) -> list[str]:
         page.evaluate(source)
-        found = page.evaluate("axe.run()")
-        assert len(found["passes"]) > 10, "axe has checked nothing"
-        serious = [finding for finding in found["violations"] if finding["impact"] in ("serious", "critical")]
-        return [f"{finding['id']}: {finding['nodes'][0]['html'][:200]}" for finding in serious]
+        serious = []
+        for scheme in ("dark", "light"):
+            page.emulate_media(color_scheme=scheme)
+            found = page.evaluate("axe.run()")
+            assert len(found["passes"]) > 10, "axe has checked nothing"
+            bad = [finding for finding in found["violations"] if finding["impact"] in ("serious", "critical")]
+            serious += [f"{scheme}, {finding['id']}: {finding['nodes'][0]['html'][:200]}" for finding in bad]
+        return serious
 
     return check
 

@@ -24,7 +24,7 @@ function wake() {
 // One look a second at whether something happened; without events every few seconds, for progress comes without them.
 async function tick() {
   const now = performance.now();
-  const due = woken || (live().dataset.live === "true" && now - lastDrawn > 4000);
+  const due = woken || (live().dataset.live === "true" && now - lastDrawn > 2500);
   if (!document.hidden && due && now - lastDrawn > atlas.pauseMs) {
     const happened = woken;
     woken = false;
