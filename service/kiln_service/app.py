@@ -56,7 +56,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         return JSONResponse(openapi_document(app))
 
     dashboard.install(app)
-    problems.install(app, tokens, config.limits)
+    problems.install(app, tokens, config.limits, dashboard.error_page)
     return app
 
 

@@ -4,7 +4,7 @@ Pure ASGI middleware, so that streamed bodies pass through untouched.
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 from urllib.parse import quote
 
@@ -74,8 +74,19 @@ def problem_response(problem: Problem) -> JSONResponse:
     return JSONResponse(problem.model_dump(mode="json"), problem.status, headers, media_type=MEDIA_TYPE)
 
 
-def install(app: FastAPI, tokens: TokenBook, limits: Limits) -> None:
+def answer(request: Request, problem: Problem) -> Response:
+    """The problem as a program or a person wants it: a document, or a page where a browser has asked for one."""
+    if is_page(request.url.path) and "text/html" in request.headers.get("accept", ""):
+        page: Response = request.app.state.error_page(request, problem)
+        return page
+    return problem_response(problem)
+
+
+def install(
+    app: FastAPI, tokens: TokenBook, limits: Limits, error_page: Callable[[Request, Problem], Response]
+) -> None:
     """Handlers for every kind of error, then (outermost last) authentication, body bounds and the last resort."""
+    app.state.error_page = error_page
     app.add_exception_handler(KilnError, _kiln_error)
     app.add_exception_handler(RequestValidationError, _invalid_request)
     app.add_exception_handler(HTTPException, _http_error)
@@ -88,51 +99,45 @@ def install(app: FastAPI, tokens: TokenBook, limits: Limits) -> None:
     app.add_middleware(SecurityHeaders)
 
 
-async def _kiln_error(_: Request, error: Exception) -> Response:
+async def _kiln_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, KilnError)
-    return problem_response(error.problem())
+    return answer(request, error.problem())
 
 
-async def _invalid_request(_: Request, error: Exception) -> Response:
+async def _invalid_request(request: Request, error: Exception) -> Response:
     """422 that names the field, its value and what is wrong with it."""
     assert isinstance(error, RequestValidationError)
-    return problem_response(problem_of_request(error))
-
-
-def problem_of_request(error: RequestValidationError) -> Problem:
-    """The same as a problem document."""
     first = error.errors()[0]
     place = [str(part) for part in first["loc"]]
     where = ".".join(place[1:] if len(place) > 1 and place[0] == "body" else place)
     value = repr(first.get("input"))
     shown = value if len(value) <= 200 else f"{value[:200]}…"
     more = f" ({len(error.errors())} faults in all)" if len(error.errors()) > 1 else ""
-    return InputError(f"{shown} is refused: {first['msg']}{more}", where=where).problem()
+    return answer(request, InputError(f"{shown} is refused: {first['msg']}{more}", where=where).problem())
 
 
 async def _http_error(request: Request, error: Exception) -> Response:
     """404 and 405 of the router."""
     assert isinstance(error, HTTPException)
     if isinstance(error.__cause__, KilnError):  # raised while FastAPI read the body
-        return problem_response(error.__cause__.problem())
+        return answer(request, error.__cause__.problem())
     about: dict[str, Any] = {"where": f"{request.method} {request.url.path}"}
     match error.status_code:
         case 404:
-            return problem_response(NotFound("there is no such route", **about).problem())
+            return answer(request, NotFound("there is no such route", **about).problem())
         case 405:
             problem = Conflict("the route does not take this method", **about).problem()
-            response = problem_response(problem.model_copy(update={"status": 405, "code": "method-not-allowed"}))
+            response = answer(request, problem.model_copy(update={"status": 405, "code": "method-not-allowed"}))
             response.headers.update(error.headers or {})
             return response
     problem = InputError(str(error.detail), **about).problem()
-    return problem_response(problem.model_copy(update={"status": error.status_code}))
+    return answer(request, problem.model_copy(update={"status": error.status_code}))
 
 
-async def _database_away(_: Request, error: Exception) -> Response:
+async def _database_away(request: Request, error: Exception) -> Response:
     log.error("the database does not answer: %s", error)
-    return problem_response(
-        Unreachable("the database does not answer", where="database", remedy="Try again in a few seconds.").problem()
-    )
+    away = Unreachable("the database does not answer", where="database", remedy="Try again in a few seconds.")
+    return answer(request, away.problem())
 
 
 async def _gone(_: Request, error: Exception) -> Response:
@@ -185,7 +190,7 @@ class LastResort:
             error = InternalError(
                 f"defect {defect}", remedy="Look the number up in the coordinator's log and report what it says."
             )
-            await problem_response(error.problem())(scope, receive, send)
+            await answer(Request(scope), error.problem())(scope, receive, send)
 
 
 class Authentication:
@@ -207,7 +212,7 @@ class Authentication:
                 await response(scope, receive, send)
                 return
             except KilnError as error:
-                await problem_response(error.problem())(scope, receive, send)
+                await answer(request, error.problem())(scope, receive, send)
                 return
             except (psycopg.OperationalError, PoolTimeout) as error:
                 await (await _database_away(request, error))(scope, receive, send)

@@ -10,6 +10,9 @@ from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 
 from kiln_service.dashboard import atlas, job, jobs, sign_in, submit, workers
+from kiln_service.dashboard.pages import error_page
+
+__all__ = ["error_page", "install"]
 
 
 def install(app: FastAPI) -> None:

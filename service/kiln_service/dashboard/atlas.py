@@ -13,12 +13,10 @@ from kiln_schemas.states import TaskState
 from kiln_service import views
 from kiln_service.api.common import Parts, PartsHere, caller
 from kiln_service.dashboard.light_fields import LightFields, TexelMapReader, read_lobes
-from kiln_service.dashboard.pages import PageRoute, see
+from kiln_service.dashboard.pages import see
 from kiln_service.db import JobRow
 
-router = APIRouter(
-    route_class=PageRoute, include_in_schema=False, dependencies=[Depends(caller(Scope.READ))], prefix="/jobs/{job_id}"
-)
+router = APIRouter(include_in_schema=False, dependencies=[Depends(caller(Scope.READ))], prefix="/jobs/{job_id}")
 
 MOST_TILES: Final = 256
 """Tiles of one request."""

@@ -14,10 +14,10 @@ from kiln_service import jobs, views
 from kiln_service.api.common import PartsHere, caller
 from kiln_service.auth import Principal
 from kiln_service.dashboard.jobs import stretch
-from kiln_service.dashboard.pages import Form, PageRoute, page, see
+from kiln_service.dashboard.pages import Form, page, see
 from kiln_service.db import Database, TaskRow
 
-router = APIRouter(route_class=PageRoute, include_in_schema=False)
+router = APIRouter(include_in_schema=False)
 
 Reader = Depends(caller(Scope.READ))
 Submitter = Annotated[Principal, Depends(caller(Scope.SUBMIT))]

@@ -13,9 +13,9 @@ from kiln_schemas.states import JobState
 from kiln_schemas.tasks import TaskKind
 from kiln_service import views
 from kiln_service.api.common import PartsHere, caller
-from kiln_service.dashboard.pages import PageRoute, page
+from kiln_service.dashboard.pages import page
 
-router = APIRouter(route_class=PageRoute, include_in_schema=False)
+router = APIRouter(include_in_schema=False)
 
 PAGE: Final = 50
 """Jobs on a page."""

@@ -4,44 +4,22 @@ Pages need no script to be read or to act: forms are sent by the browser and ans
 what HTML cannot do (fresh numbers, the atlas, curves).
 """
 
-from collections.abc import Callable, Coroutine
 from datetime import UTC, datetime
 from typing import Annotated, Any, Final
 from urllib.parse import parse_qs, parse_qsl, urlencode
 
 from fastapi import Depends, Request
-from fastapi.exceptions import RequestValidationError
-from fastapi.responses import HTMLResponse, RedirectResponse, Response
-from fastapi.routing import APIRoute
+from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from kiln_schemas import __version__
-from kiln_schemas.errors import InputError, KilnError, Problem
+from kiln_schemas.errors import InputError, Problem
 from kiln_schemas.operators import Scope
 from kiln_service import sessions
 from kiln_service.auth import Principal
-from kiln_service.problems import problem_of_request
 
 MOST_FIELDS: Final = 8192
 """Fields of a form: a bundle may have 4096 files."""
-
-
-class PageRoute(APIRoute):
-    """A route whose errors are pages, where a browser asks for one."""
-
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        handle = super().get_route_handler()
-
-        async def handle_page(request: Request) -> Response:
-            try:
-                return await handle(request)
-            except (KilnError, RequestValidationError) as error:
-                if "text/html" not in request.headers.get("accept", ""):
-                    raise
-                problem = error.problem() if isinstance(error, KilnError) else problem_of_request(error)
-                return error_page(request, problem)
-
-        return handle_page
 
 
 def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:

@@ -6,9 +6,9 @@ from fastapi.responses import Response
 from kiln_schemas.errors import AuthError
 from kiln_service import sessions
 from kiln_service.api.common import PartsHere
-from kiln_service.dashboard.pages import Form, PageRoute, page, read_form, see
+from kiln_service.dashboard.pages import Form, page, read_form, see
 
-router = APIRouter(route_class=PageRoute, include_in_schema=False)
+router = APIRouter(include_in_schema=False)
 
 START = "/jobs"
 

@@ -11,7 +11,7 @@ from kiln_schemas.settings import PRESETS
 from kiln_service import jobs
 from kiln_service.api.common import PartsHere, caller
 from kiln_service.auth import Principal
-from kiln_service.dashboard.pages import PageRoute, check_session, page
+from kiln_service.dashboard.pages import check_session, page
 from kiln_service.problems import UPLOAD_PATH
 
 
@@ -19,7 +19,7 @@ def _checked(request: Request, x_csrf_token: Annotated[str, Header()] = "") -> N
     check_session(request, x_csrf_token)
 
 
-router = APIRouter(route_class=PageRoute, include_in_schema=False)
+router = APIRouter(include_in_schema=False)
 
 Submitter = Annotated[Principal, Depends(caller(Scope.SUBMIT))]
 Checked = Depends(_checked)

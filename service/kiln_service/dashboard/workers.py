@@ -9,9 +9,9 @@ from kiln_schemas.operators import Order, Scope
 from kiln_service import operators
 from kiln_service.api.common import PartsHere, caller
 from kiln_service.auth import Principal
-from kiln_service.dashboard.pages import Form, PageRoute, page, see
+from kiln_service.dashboard.pages import Form, page, see
 
-router = APIRouter(route_class=PageRoute, include_in_schema=False)
+router = APIRouter(include_in_schema=False)
 
 SILENT_SHARE: Final = 0.5
 """A running task is shown as stuck at this share of the silence after which it is given to another worker,"""
