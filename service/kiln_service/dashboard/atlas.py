@@ -66,9 +66,10 @@ async def irradiance(
     side = job.settings.lightmap.tile
     if side % stride:
         raise InputError(f"{stride} does not divide the tile's {side} texels", where="stride")
+    places = [_tile(word) for word in tile]
     fields = LightFields(job.store_url, job.settings)
     await fields.open()
-    return _bytes(await fields.irradiance([_tile(word) for word in tile], stride))
+    return _bytes(await fields.irradiance(places, stride))
 
 
 @router.get("/texels/{row}/{column}")

@@ -28,6 +28,7 @@ AT_ONCE: Final = 16
 HEADER_BYTES: Final = 4096
 """Of a texel map; more than its header has."""
 MOST_LAYERS: Final = 128
+KTX2_IDENTIFIER: Final = b"\xabKTX 20\xbb\r\n\x1a\n"
 KTX2_HEAD: Final = struct.Struct("<12s9I4I2Q3Q")
 """Identifier, format to supercompression, index, and the first level's place (KTX 2.0, 3)."""
 
@@ -115,12 +116,16 @@ class LightFields:
 async def read_lobes(blobs: Blobs, sha256: str, row: int, column: int) -> list[tuple[float, ...]]:
     """Lobes of a texel of `lightfield.ktx2`, seven numbers each; InputError where it is supercompressed."""
     head = await _bytes(blobs, sha256, 0, KTX2_HEAD.size)
+    if len(head) < KTX2_HEAD.size or not head.startswith(KTX2_IDENTIFIER):
+        raise InputError("it is no KTX2 file", where=LIGHT_FIELD_KTX2)
     _, _, _, width, height, _, layers, _, _, scheme, *_, offset, _, _ = KTX2_HEAD.unpack(head)
     if scheme != 0:
         raise InputError("the lobes are compressed", where=LIGHT_FIELD_KTX2, remedy="Download the package.")
     if row >= height or column >= width or layers > MOST_LAYERS or layers % LAYERS_PER_LOBE:
         raise InputError(f"{layers} layers of {width} x {height} texels are no lobes", where=LIGHT_FIELD_KTX2)
     places = [offset + 8 * ((layer * height + row) * width + column) for layer in range(layers)]
+    if places and places[-1] + 8 > await blobs.size(sha256):
+        raise InputError("the file ends before its lobes do", where=LIGHT_FIELD_KTX2)
     texels = [struct.unpack("<4e", part) for part in await blobs.read_parts(sha256, places, 8)]
     pairs = zip(texels[::LAYERS_PER_LOBE], texels[1::LAYERS_PER_LOBE], strict=True)
     return [(*axis, *amplitude[:3]) for axis, amplitude in pairs]
@@ -150,6 +155,8 @@ class TexelMapReader:
         """One byte for every `stride`-th texel of every `stride`-th row."""
         side, start = self._resolution, self._starts["state"]
         data = await _bytes(self._blobs, self._sha256, start, start + side * side)
+        if len(data) != side * side:
+            raise InputError("the texel map ends early", where=self._sha256)
         return b"".join(data[row * side : (row + 1) * side : stride] for row in range(0, side, stride))
 
     async def normal(self, row: int, column: int) -> tuple[float, ...]:
@@ -162,4 +169,8 @@ class TexelMapReader:
 
 
 async def _bytes(blobs: Blobs, sha256: str, start: int, end: int) -> bytes:
+    """Bytes start..end-1 of a blob, fewer where it ends before."""
+    end = min(end, await blobs.size(sha256))
+    if start >= end:
+        return b""
     return b"".join([piece async for piece in blobs.read(sha256, start, end)])

@@ -268,6 +268,12 @@ def test_jobs_are_found_and_the_list_stays_fresh(home, dashboard, baked, screens
     expect(names).to_have_text(["stopped"])
     page.goto(f"{dashboard.url}/jobs?q=%3Dx")
     expect(page.get_by_role("alert")).to_contain_text("'=x' is not a label")
+    page.goto(f"{dashboard.url}/jobs?q=tower")
+    home.sql("DELETE FROM sessions")  # an open page leads to the sign-in, and back
+    expect(page.get_by_label("Access token")).to_be_visible()
+    page.get_by_label("Access token").fill(dashboard.token)
+    page.get_by_label("Access token").press("Enter")
+    expect(names).to_have_text(["tower"])
 
 
 def test_workers_are_seen_and_told_and_stuck_tasks_stand_out(home, dashboard, screenshot, axe):

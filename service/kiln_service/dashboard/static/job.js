@@ -35,9 +35,19 @@ async function tick() {
   setTimeout(tick, 500);
 }
 
-if (live().dataset.live === "true") {
-  const events = new EventSource(`/v1/jobs/${job}/events?after=${live().dataset.event}`);
+// A browser has six connections to a host in all its tabs: only the tab that is looked at keeps one.
+let events = null;
+
+function follow() {
+  events?.close();
+  events = null;
+  if (document.hidden || live().dataset.live !== "true") return;
+  events = new EventSource(`/v1/jobs/${job}/events?after=${live().dataset.event}`);
   for (const kind of KINDS) events.addEventListener(kind, wake);
+  wake();
 }
+
+document.addEventListener("visibilitychange", follow);
+follow();
 wake();
 tick();
