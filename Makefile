@@ -6,7 +6,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint node clean
+.PHONY: help venv demo test lint node chromium clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -35,7 +35,10 @@ lint: venv
 node:
 	@deploy/install/node.sh
 
-test: lint node
+chromium:
+	@deploy/install/chromium.sh
+
+test: lint node chromium
 	$(BIN)/pytest
 
 clean:

@@ -180,7 +180,7 @@ export class Atlas {
   exposure() {
     const bright = [];
     for (const values of this.light.values()) for (let i = 1; i < values.length; i += 3 * 7) bright.push(values[i]);
-    return (2 ** Number(document.getElementById("ev").value) * 1.5) / (quantile(bright, 0.9) || 1);
+    return (2 ** Number(document.getElementById("ev").value) * 0.8) / (quantile(bright, 0.9) || 1);
   }
 
   errorEnds() {
