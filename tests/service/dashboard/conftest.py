@@ -202,7 +202,7 @@ def screenshot() -> Callable[[Page, str], None]:
             page.emulate_media(color_scheme=scheme)
             for device, size in (("desktop", (1280, 900)), ("phone", (390, 800))):
                 page.set_viewport_size({"width": size[0], "height": size[1]})
-                page.wait_for_timeout(150)
+                page.wait_for_timeout(60)
                 page.screenshot(path=SCREENSHOTS / f"{name}-{scheme}-{device}.png", full_page=True)
         page.emulate_media(color_scheme="light")
         page.set_viewport_size({"width": 1280, "height": 900})

@@ -248,9 +248,16 @@ def test_cancel_asks_first(home, dashboard, screenshot, axe):
 
 def test_jobs_are_found_and_the_list_stays_fresh(home, dashboard, baked, screenshot, axe):
     home.submit(name="courtyard", labels={"project": "castle"}, priority=80)
+    hostile = '<img src=x onerror="document.title=1">'
+    archived = home.submit(name=hostile, labels={"a": '"><script>document.title=2</script>'})["id"]
     stopped = home.submit(name="stopped")["id"]
     home.client.post(f"/v1/jobs/{stopped}/cancel").raise_for_status()
-    page = dashboard.open("/jobs")
+    page = dashboard.open(f"/jobs/{archived}")
+    expect(page.get_by_role("heading", name=hostile)).to_be_visible()
+    assert page.title() == f"{hostile} – lightkiln"
+    for action in ("cancel", "archive"):
+        home.client.post(f"/v1/jobs/{archived}/{action}").raise_for_status()
+    page.goto(f"{dashboard.url}/jobs")
     names = page.locator("#jobs tbody th > a:first-child")
     expect(names).to_have_text(["stopped", "courtyard", "baked"])
     assert axe(page) == []

@@ -3,7 +3,9 @@
 import { colourOfState, quantile, readKtx2, refusal, shown, viridis } from "./halves.js";
 
 const FINEST = 1024; // pixels along each side of the picture, at most
-const AT_ONCE = 64; // tiles of one request
+const MOST_TILES = 256; // of one request
+const BYTES = 2 ** 20; // of one answer, about
+const DRAW_MS = 500; // between two pictures while tiles come in
 const GUTTER = [0, 0, 0, 0];
 
 export class Atlas {
@@ -102,8 +104,10 @@ export class Atlas {
     const done = this.states.indexOf("completed");
     const missing = this.tiles.filter(([r, c, , state]) => state === done && !this.light.has(`${r},${c}`));
     const side = this.tile / this.stride, floats = 3 * side * side;
-    for (let start = 0; start < missing.length; start += AT_ONCE) {
-      const part = missing.slice(start, start + AT_ONCE);
+    const atOnce = Math.min(Math.max(Math.floor(BYTES / (4 * floats)), 16), MOST_TILES);
+    let drawn = performance.now();
+    for (let start = 0; start < missing.length; start += atOnce) {
+      const part = missing.slice(start, start + atOnce);
       const query = part.map(([r, c]) => `tile=${r},${c}`).join("&");
       const reply = await fetch(`/jobs/${this.job}/irradiance?stride=${this.stride}&${query}`);
       if (!reply.ok) {
@@ -113,9 +117,11 @@ export class Atlas {
       this.trouble = null;
       const values = new Float32Array(await reply.arrayBuffer());
       part.forEach(([r, c], place) => this.light.set(`${r},${c}`, values.slice(place * floats, (place + 1) * floats)));
+      if (performance.now() - drawn < DRAW_MS) continue;
       this.draw();
+      drawn = performance.now();
     }
-    this.draw();
+    if (missing.length) this.draw();
   }
 
   async readError() {
