@@ -192,6 +192,8 @@ class Work:
             else:
                 await transitions.add_tasks(tx, job, [replace(task, ready=False) for task in planned])
                 await transitions.reuse_renders(tx, job, source.job_id, source.store_url)
+        if isinstance(result, FitResult):
+            await tx.run("drop_losses", task_id=task.id)  # the whole curve is in the result
         if isinstance(result, PackageResult):
             for artifact in result.artifacts:
                 await tx.run("add_artifact", job_id=job.id, **artifact.model_dump())

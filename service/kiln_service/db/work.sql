@@ -89,6 +89,10 @@ RETURNING jobs.state AS job_state;
 INSERT INTO losses (task_id, step, loss) VALUES (%(task_id)s, %(step)s, %(loss)s)
 ON CONFLICT (task_id, step) DO UPDATE SET loss = excluded.loss;
 
+-- name: drop_losses
+-- Forget what attempts of a task told.
+DELETE FROM losses WHERE task_id = %(task_id)s;
+
 -- name: add_log
 -- Lines that an attempt wrote; nothing where the task is unknown.
 INSERT INTO task_logs (task_id, attempt, lines)
