@@ -149,6 +149,10 @@ def test_pages_may_run_and_load_their_own_files_alone(shared):
         for path in ("/jobs", "/login", "/static/dashboard.css", "/static/vendor/htmx/htmx.min.js"):
             policy = mine.get(path).raise_for_status().headers["content-security-policy"]
             assert "default-src 'none'" in policy and "script-src 'self';" in policy and "unsafe" not in policy
+        script = mine.get("/static/refresh.js")
+        assert script.headers["cache-control"] == "no-cache"
+        again = mine.get("/static/refresh.js", headers={"If-None-Match": script.headers["etag"]})
+        assert again.status_code == 304 and not again.content
         headers = mine.get("/v1/jobs").headers
         assert headers["content-security-policy"].startswith("sandbox;")
         assert headers["x-content-type-options"] == "nosniff"
