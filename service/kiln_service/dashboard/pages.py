@@ -107,6 +107,11 @@ def _ago(at: datetime | None) -> str:
     return "just now" if seconds < 5 else f"{_duration(seconds).split(' ')[0]} {_duration(seconds).split(' ')[1]} ago"
 
 
+def _sentence(text: str) -> str:
+    """With a capital letter and a full stop."""
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
+
+
 def _told(value: object) -> str:
     """What an event tells, in few words."""
     if isinstance(value, float):
@@ -132,5 +137,5 @@ _templates = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_templates.filters |= {"duration": _duration, "bytes": _bytes, "ago": _ago, "told": _told}
+_templates.filters |= {"duration": _duration, "bytes": _bytes, "ago": _ago, "told": _told, "sentence": _sentence}
 _templates.globals |= {"with_query": _with_query}

@@ -328,7 +328,7 @@ def test_who_may_only_read_sees_no_buttons_and_is_told_why_not(start, browser):
             }""",
             [f"/jobs/{job}/do/cancel", token],
         )
-        expect(page.get_by_role("alert")).to_contain_text("the token 'looker' has no scope 'submit'")
+        expect(page.get_by_role("alert")).to_contain_text("The token 'looker' has no scope 'submit'")
         assert home.job(job)["state"] == "queued"
         page.goto(f"{dashboard.url}/workers")
         expect(page.get_by_text("node-1")).to_be_visible()
