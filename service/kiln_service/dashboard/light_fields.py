@@ -173,4 +173,4 @@ async def _bytes(blobs: Blobs, sha256: str, start: int, end: int) -> bytes:
     end = min(end, await blobs.size(sha256))
     if start >= end:
         return b""
-    return b"".join([piece async for piece in blobs.read(sha256, start, end)])
+    return (await blobs.read_parts(sha256, [start], end - start))[0]
