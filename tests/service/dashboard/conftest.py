@@ -192,6 +192,23 @@ def known_bake(home: Any) -> Callable[[str], KnownBake]:
     return make
 
 
+@pytest.fixture
+def job(home: Any) -> str:
+    return str(home.submit()["id"])
+
+
+@pytest.fixture
+def rendered(home: Any, job: str, known_bake: Callable[[str], KnownBake]) -> KnownBake:
+    """The job with two of four tiles rendered."""
+    bake, worker = known_bake(job), home.worker()
+    worker.finish(worker.must_claim(), tiles=4, texel_map=bake.texel_map)
+    for _ in range(2):
+        claim = worker.must_claim("render")
+        bake.render(claim["payload"]["tile"])
+        worker.finish(claim)
+    return bake
+
+
 @pytest.fixture(scope="session")
 def screenshot() -> Callable[[Page, str], None]:
     """Keep the page as it is, in both schemes, on a desk and on a phone, for people to look at."""

@@ -11,23 +11,6 @@ import pytest
 from kiln_workers.package import ktx2
 
 
-@pytest.fixture
-def job(home):
-    return home.submit()["id"]
-
-
-@pytest.fixture
-def rendered(home, job, known_bake):
-    """A job with two of four tiles rendered."""
-    bake, worker = known_bake(job), home.worker()
-    worker.finish(worker.must_claim(), tiles=4, texel_map=bake.texel_map)
-    for _ in range(2):
-        claim = worker.must_claim("render")
-        bake.render(claim["payload"]["tile"])
-        worker.finish(claim)
-    return bake
-
-
 def test_tiles_are_told_with_their_states(home, job, rendered):
     told = home.client.get(f"/jobs/{job}/atlas").json()
     assert (told["resolution"], told["tile"]) == (32, 8)
