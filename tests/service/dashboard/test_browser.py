@@ -337,3 +337,17 @@ def test_who_may_only_read_sees_no_buttons_and_is_told_why_not(start, browser):
         expect(page.get_by_role("alert")).to_contain_text("has no scope 'submit'")
         page.context.close()
         assert dashboard.faults == []
+
+
+def test_without_scripts_people_still_see_and_act(home, dashboard, baked):
+    job = home.submit(name="plain")["id"]
+    page = dashboard.open("/jobs?q=plain", java_script_enabled=False)
+    page.get_by_role("link", name="plain").click()
+    page.get_by_role("button", name="Cancel…").click()
+    page.get_by_role("button", name="Cancel the job").click()
+    expect(page.locator(".head .chip")).to_have_text("canceled")
+    assert home.job(job)["state"] == "canceled"
+    page.goto(f"{dashboard.url}/jobs/{baked[0]}")
+    expect(page.locator("#artifacts")).to_contain_text("lightfield.ktx2")
+    page.get_by_role("button", name="Sign out").click()
+    expect(page.get_by_label("Access token")).to_be_visible()
