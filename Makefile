@@ -7,7 +7,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test hostile lint node clean
+.PHONY: help venv demo test hostile lint node chromium clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -36,7 +36,10 @@ lint: venv
 node:
 	@deploy/install/node.sh
 
-test: lint node
+chromium:
+	@deploy/install/chromium.sh
+
+test: lint node chromium
 	$(BIN)/pytest
 
 hostile: venv

@@ -138,6 +138,19 @@ class TaskView(Contract):
     error: Problem | None = None
 
 
+class CurveView(Contract):
+    """How the loss of a task went so far."""
+
+    task_id: str
+    kind: TaskKind
+    label: str
+    state: TaskState
+    steps: float | None
+    """How many there will be; None before the task has told."""
+    points: tuple[tuple[float, float], ...]
+    """(step, training loss), in the order of steps."""
+
+
 class EventView(Contract):
     """One line of a job's append-only history."""
 

@@ -15,7 +15,7 @@ from fastapi.responses import JSONResponse
 from kiln_schemas import __version__
 from kiln_schemas.errors import InputError
 from kiln_schemas.operators import Scope
-from kiln_service import problems
+from kiln_service import dashboard, problems
 from kiln_service.api import blobs as blob_routes
 from kiln_service.api import health as health_routes
 from kiln_service.api import jobs as job_routes
@@ -30,6 +30,7 @@ from kiln_service.db.migrate import migrate
 from kiln_service.events import Signals
 from kiln_service.maintenance import Maintenance
 from kiln_service.metrics import RequestSeconds
+from kiln_service.rates import RateLimits
 from kiln_service.webhooks import Deliverer
 from kiln_service.work import Work
 
@@ -37,11 +38,12 @@ from kiln_service.work import Work
 def create_app(config: ServiceConfig) -> FastAPI:
     """The application for a configuration whose `database` is set (`serve.py` starts the embedded one)."""
     config.data.mkdir(parents=True, exist_ok=True)
+    tokens = TokenBook([own_token(config.data), *config.tokens])
     app = FastAPI(
         title="lightkiln",
         version=__version__,
         summary="Distributed bakes of spherical Gaussian light-field textures",
-        lifespan=lambda app: _lifespan(app, config),
+        lifespan=lambda app: _lifespan(app, config, tokens),
         generate_unique_id_function=lambda route: route.name,
         openapi_url=None,
         docs_url=None,
@@ -56,7 +58,9 @@ def create_app(config: ServiceConfig) -> FastAPI:
         return JSONResponse(openapi_document(app))
 
     app.state.request_seconds = RequestSeconds()
-    problems.install(app, TokenBook([own_token(config.data), *config.tokens]), config.limits)
+    app.state.rates = RateLimits(config.limits.rates)
+    dashboard.install(app)
+    problems.install(app, tokens, config.limits, dashboard.error_page)
     return app
 
 
@@ -81,7 +85,7 @@ def openapi_document(app: FastAPI) -> dict[str, object]:
 
 
 @contextlib.asynccontextmanager
-async def _lifespan(app: FastAPI, config: ServiceConfig) -> AsyncIterator[None]:
+async def _lifespan(app: FastAPI, config: ServiceConfig, tokens: TokenBook) -> AsyncIterator[None]:
     """Connect, migrate, run the background work; undo it all at the end."""
     if config.database is None:
         raise InputError("no database is configured", where="database", remedy="Start it with `lightkiln serve`.")
@@ -90,7 +94,7 @@ async def _lifespan(app: FastAPI, config: ServiceConfig) -> AsyncIterator[None]:
         signals = Signals(database)
         blobs = Blobs(database, config.blob_base, config.incoming, config.limits)
         work = Work(database, config, signals)
-        app.state.parts = Parts(config, database, blobs, signals, work)
+        app.state.parts = Parts(config, database, blobs, signals, work, tokens)
         background = [
             asyncio.create_task(signals.listen(), name="signals"),
             asyncio.create_task(Deliverer(database, config.timing).run(), name="webhooks"),

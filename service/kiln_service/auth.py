@@ -71,22 +71,27 @@ class TokenBook:
                 remedy="Send `Authorization: Bearer TOKEN` (by default it is in the data folder's file `token`).",
             )
         scheme, _, token = header.partition(" ")
-        digest = hashlib.sha256(token.strip().encode()).hexdigest()
-        found: TokenEntry | None = None
-        for entry in self._entries:  # all of them, so that the time tells nothing
-            if hmac.compare_digest(entry.sha256, digest):
-                found = entry
-        bearer = scheme.lower() == "bearer"
-        if bearer and found is not None:
-            return Principal(found.name, frozenset(found.scopes))
-        stored = await self._stored(digest, database, before_lookup) if bearer else None
-        if stored is None:
+        known = scheme.lower() == "bearer"
+        principal = await self.find(digest_of(token.strip()), database, before_lookup) if known else None
+        if principal is None:
             raise AuthError(
                 "the token is not known here",
                 where="Authorization",
                 remedy="Check the token and the coordinator's URL.",
             )
-        return stored
+        return principal
+
+    async def find(
+        self, digest: str, database: Database, before_lookup: Callable[[], None] = lambda: None
+    ) -> Principal | None:
+        """Whose token has this sha256."""
+        found: TokenEntry | None = None
+        for entry in self._entries:  # all of them, so that the time tells nothing
+            if hmac.compare_digest(entry.sha256, digest):
+                found = entry
+        if found is not None:
+            return Principal(found.name, frozenset(found.scopes))
+        return await self._stored(digest, database, before_lookup)
 
     async def _stored(self, digest: str, database: Database, before_lookup: Callable[[], None]) -> Principal | None:
         """Whose token of the database has this hash, as of MEMORY_S ago or later."""
@@ -107,6 +112,11 @@ class TokenBook:
             self._remembered.clear()
         self._remembered[digest] = principal, now + MEMORY_S
         return principal
+
+
+def digest_of(secret: str) -> str:
+    """What is kept of a token or cookie: its sha256."""
+    return hashlib.sha256(secret.encode()).hexdigest()
 
 
 def own_token(data: Path) -> TokenEntry:
@@ -139,5 +149,4 @@ def own_token(data: Path) -> TokenEntry:
 
 
 def _owner(token: str) -> TokenEntry:
-    digest = hashlib.sha256(token.encode()).hexdigest()
-    return TokenEntry(name=OWN_TOKEN, sha256=digest, scopes=(Scope.ADMIN,))
+    return TokenEntry(name=OWN_TOKEN, sha256=digest_of(token), scopes=(Scope.ADMIN,))

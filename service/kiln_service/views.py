@@ -8,7 +8,7 @@ from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
 from kiln_schemas.errors import InputError, NotFound
-from kiln_schemas.job import JobPage, JobView, StageView, TaskView
+from kiln_schemas.job import CurveView, JobPage, JobView, StageView, TaskView
 from kiln_schemas.states import FINAL_JOB_STATES, OVER_TASK_STATES, JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
 from kiln_service.db import Database, JobRow, TaskRow, Tx
@@ -17,6 +17,8 @@ from kiln_service.planner import METHODS
 
 LEAST_FRACTION: Final = 0.05
 """A running task says nothing about its duration before this."""
+CURVE_POINTS: Final = 1000
+"""About the most points of the curve of a task that runs."""
 
 
 async def job_view(database: Database, job_id: str) -> JobView:
@@ -61,7 +63,15 @@ async def task_views(
     async with database.transaction() as tx:
         await _require_job(tx, job_id)
         rows = await tx.all("list_tasks", job_id=job_id, kind=kind, state=state)
-    return tuple(_task_view(TaskRow.of(row), row["worker"]) for row in rows)
+    return tuple(task_view(TaskRow.of(row), row["worker"]) for row in rows)
+
+
+async def curves(database: Database, job_id: str) -> tuple[CurveView, ...]:
+    """The losses of a job's fits, while they run and after."""
+    async with database.transaction() as tx:
+        await _require_job(tx, job_id)
+        rows = await tx.all("list_curves", job_id=job_id, points=CURVE_POINTS)
+    return tuple(CurveView.model_validate(row) for row in rows)
 
 
 async def task_log(database: Database, task_id: str, tail: int | None = None) -> str:
@@ -211,7 +221,8 @@ def _stage_view(row: DictRow) -> StageView:
     )
 
 
-def _task_view(task: TaskRow, worker: str | None) -> TaskView:
+def task_view(task: TaskRow, worker: str | None) -> TaskView:
+    """A task with the name of its worker."""
     return TaskView(
         id=task.id,
         kind=task.kind,

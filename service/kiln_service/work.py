@@ -134,6 +134,8 @@ class Work:
                 attempt=beat.attempt,
                 progress=Jsonb(beat.progress.model_dump(mode="json")) if beat.progress else None,
             )
+            if row is not None and beat.progress is not None and beat.progress.loss is not None:
+                await tx.run("add_loss", task_id=beat.task_id, step=beat.progress.done, loss=beat.progress.loss)
             await tx.run("see_worker", id=worker_id)
         if row is None:
             return HeartbeatReply(stop=True, reason="the task was given to another attempt or is over")
@@ -199,6 +201,8 @@ class Work:
             else:
                 await transitions.add_tasks(tx, job, [replace(task, ready=False) for task in planned])
                 await transitions.reuse_renders(tx, job, source.job_id, source.store_url)
+        if isinstance(result, FitResult):
+            await tx.run("drop_losses", task_id=task.id)  # the whole curve is in the result
         if isinstance(result, PackageResult):
             for artifact in result.artifacts:
                 await tx.run("add_artifact", job_id=job.id, **artifact.model_dump())

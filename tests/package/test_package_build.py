@@ -21,6 +21,7 @@ WITHOUT_ENVIRONMENT = {
     "lightfield.ktx2",
     "irradiance.exr",
     "irradiance.ktx2",
+    "errors.ktx2",
     "scene.glb",
     "report.html",
     "manifest.json",
@@ -113,6 +114,17 @@ def test_irradiance_is_kept_where_valid_and_finite_everywhere(make_sample, tmp_p
     halves = ktx2.read(tmp_path / "irradiance.ktx2").levels[0][0, 0]
     np.testing.assert_array_equal(halves[..., :3], floats.astype(np.float16))
     assert (halves[..., 3] == 1.0).all()
+
+
+def test_errors_are_told_where_there_are_lobes(make_sample, tmp_path: Path) -> None:
+    given = make_sample().given
+    build_package(tmp_path, given)
+    told = ktx2.read(tmp_path / "errors.ktx2").levels[0][0, 0]
+    for channel, function in enumerate((Function.LIGHT_FIELD, Function.VISIBILITY)):
+        errors = given.preview.functions[function].errors
+        there = np.isfinite(errors)
+        np.testing.assert_array_equal(told[there, channel], errors[there].astype(np.float16))
+        assert there.any() and (told[there, 3] == 1.0).all() and (told[~there, channel] == 0.0).all()
 
 
 def test_environment_textures_read_back(make_sample, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from fastapi.security import HTTPBearer
 
 from kiln_schemas.errors import Problem
 from kiln_schemas.operators import Scope
-from kiln_service.auth import Principal
+from kiln_service.auth import Principal, TokenBook
 from kiln_service.blobs import Blobs
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database
@@ -26,6 +26,7 @@ class Parts:
     blobs: Blobs
     signals: Signals
     work: Work
+    tokens: TokenBook
 
 
 _bearer = HTTPBearer(auto_error=False, description="An access token (the file `token` of the data folder).")
@@ -38,7 +39,10 @@ def _parts(request: Request) -> Parts:
 
 
 def caller(scope: Scope) -> Callable[..., Principal]:
-    """A dependency: the authenticated caller, who must have the scope."""
+    """A dependency: the authenticated caller, who must have the scope.
+
+    Pages use it too: a browser that is signed in is known by its cookie (`kiln_service.problems.Authentication`).
+    """
 
     def check(request: Request, _: Annotated[object, Security(_bearer)]) -> Principal:
         principal = request.scope["principal"]

@@ -6,7 +6,17 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 
 from kiln_schemas.errors import InputError
-from kiln_schemas.job import EventView, JobChange, JobPage, JobRequest, JobView, RequeueRequest, TaskView, read_labels
+from kiln_schemas.job import (
+    CurveView,
+    EventView,
+    JobChange,
+    JobPage,
+    JobRequest,
+    JobView,
+    RequeueRequest,
+    TaskView,
+    read_labels,
+)
 from kiln_schemas.operators import Scope
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
@@ -128,6 +138,12 @@ async def tasks(
 ) -> tuple[TaskView, ...]:
     """The job's tasks in the order of planning."""
     return await views.task_views(parts.database, job_id, kind, state)
+
+
+@router.get("/jobs/{job_id}/curves", dependencies=[Reader], responses=problems(404))
+async def curves(job_id: str, parts: PartsHere) -> tuple[CurveView, ...]:
+    """The losses of the job's fits over their steps, while they run and after."""
+    return await views.curves(parts.database, job_id)
 
 
 @router.get(

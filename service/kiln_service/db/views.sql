@@ -61,3 +61,18 @@ SELECT name, sha256, size, media_type FROM artifacts WHERE job_id = %(job_id)s O
 -- name: find_artifact
 -- One artifact of a job.
 SELECT name, sha256, size, media_type FROM artifacts WHERE job_id = %(job_id)s AND name = %(name)s;
+
+-- name: list_curves
+-- Losses of a job's tasks over their steps: those of the result, or those told so far, at most `points` of these.
+SELECT tasks.id AS task_id, tasks.kind, tasks.label, tasks.state,
+       COALESCE((progress ->> 'total')::float8, (result ->> 'steps')::float8) AS steps,
+       COALESCE(
+           (SELECT jsonb_agg(jsonb_build_array(point -> 'step', point -> 'loss') ORDER BY (point ->> 'step')::float8)
+            FROM jsonb_array_elements(result -> 'curve') AS point),
+           (SELECT jsonb_agg(jsonb_build_array(step, loss) ORDER BY step) FROM (
+               SELECT step, loss, row_number() OVER (ORDER BY step DESC) AS place, count(*) OVER () AS told FROM losses
+               WHERE task_id = tasks.id AND step <= COALESCE((progress ->> 'done')::float8, 'Infinity')
+           ) AS numbered WHERE (place - 1) %% (1 + told / %(points)s) = 0),
+           '[]'
+       ) AS points
+FROM tasks WHERE job_id = %(job_id)s AND kind = 'fit' ORDER BY ordinal;

@@ -187,6 +187,15 @@ FROM jobs
 WHERE tasks.id = %(id)s AND tasks.attempt = %(attempt)s AND tasks.state = 'active' AND jobs.id = tasks.job_id
 RETURNING jobs.state AS job_state;
 
+-- name: add_loss
+-- Remember a running attempt's loss; one that begins again from a checkpoint tells the same steps anew.
+INSERT INTO losses (task_id, step, loss) VALUES (%(task_id)s, %(step)s, %(loss)s)
+ON CONFLICT (task_id, step) DO UPDATE SET loss = excluded.loss;
+
+-- name: drop_losses
+-- Forget what attempts of a task told.
+DELETE FROM losses WHERE task_id = %(task_id)s;
+
 -- name: add_log
 -- Lines that an attempt wrote; nothing where the task is unknown.
 INSERT INTO task_logs (task_id, attempt, lines)

@@ -16,6 +16,7 @@ from kiln_schemas import __version__
 from kiln_schemas.conventions import (
     ENVIRONMENT_GGX_KTX2,
     ENVIRONMENT_U_KTX2,
+    ERRORS_KTX2,
     FORMAT_VERSION,
     IRRADIANCE_EXR,
     IRRADIANCE_KTX2,
@@ -155,6 +156,7 @@ def build_package(folder: Path, given: PackageInput, judge: Judge | None = None)
         _write_lobes(package, function, lobe_map, plan_fill(lobe_map.mask, given.texel_map.chart))
     irradiance = plan_fill(valid, given.texel_map.chart).smooth(given.irradiance)
     _write_irradiance(package, irradiance)
+    _write_errors(package)
     if given.environment is not None:
         _write_environment(package, given.environment)
     write_bytes(folder / SCENE_GLB, encode_glb(given.scene))
@@ -218,6 +220,20 @@ def _write_irradiance(package: _Package, irradiance: Float32) -> None:
     package.add(IRRADIANCE_EXR)
     texture = ktx2.texture_2d(package.half(irradiance), {"lightkiln.unit": unit})
     package.add_texture(IRRADIANCE_KTX2, texture, {"channels": ["r", "g", "b", "1"], "unit": unit})
+
+
+def _write_errors(package: _Package) -> None:
+    """How well each texel's lobes represent what was rendered: where to look when a bake is poor."""
+    shape = package.given.texel_map.state.shape
+    values = np.zeros((*shape, 4), np.float32)
+    for channel, function in enumerate(LOBE_FILES):
+        if function in package.given.preview.functions:
+            errors = package.given.preview.functions[function].errors
+            values[..., channel] = np.nan_to_num(errors)
+            values[..., 3] = np.maximum(values[..., 3], np.isfinite(errors))
+    half, _ = to_half(values)
+    channels = ["log_mse of the light field", "log_mse of the visibility", "0", "1 where the texel has lobes"]
+    package.add_texture(ERRORS_KTX2, ktx2.texture_2d(half, {"lightkiln.errors": "log_mse"}), {"channels": channels})
 
 
 def _write_environment(package: _Package, environment: EnvironmentTextures) -> None:

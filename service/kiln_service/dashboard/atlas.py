@@ -1,0 +1,133 @@
+"""What a job's page draws: the tiles of the atlas, which texels there are, their irradiance, single light fields."""
+
+import base64
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Depends, Path, Query
+from fastapi.responses import JSONResponse, Response
+
+from kiln_schemas.conventions import LIGHT_FIELD_KTX2
+from kiln_schemas.errors import InputError, KilnError, NotFound
+from kiln_schemas.operators import Scope
+from kiln_schemas.states import TaskState
+from kiln_service import views
+from kiln_service.api.common import Parts, PartsHere, caller
+from kiln_service.dashboard.light_fields import LightFields, TexelMapReader, read_lobes
+from kiln_service.dashboard.pages import see
+from kiln_service.db import JobRow
+
+router = APIRouter(include_in_schema=False, dependencies=[Depends(caller(Scope.READ))], prefix="/jobs/{job_id}")
+
+MOST_TILES: Final = 256
+"""Tiles of one request."""
+MOST_STATES: Final = 2048
+"""Texels along each side of the largest light map whose texels are told one by one."""
+
+Coordinate = Annotated[int, Path(ge=0, lt=8192)]
+Stride = Annotated[int, Query(ge=1, le=64)]
+
+
+@router.get("/atlas")
+async def atlas(job_id: str, parts: PartsHere) -> Response:
+    """The tiles as [row, column, size, state], the state as an index into `states`."""
+    job = await _job(parts, job_id)
+    states = [state.value for state in TaskState]
+    async with parts.database.transaction() as tx:
+        rows = await tx.all("atlas_tiles", job_id=job_id)
+    return JSONResponse(
+        {
+            "resolution": job.settings.lightmap.resolution,
+            "tile": job.settings.lightmap.tile,
+            "states": states,
+            "tiles": [[row["row"], row["column"], row["size"], states.index(row["state"])] for row in rows],
+        },
+        headers={"Cache-Control": "no-store"},
+    )
+
+
+@router.get("/texels")
+async def texels(job_id: str, parts: PartsHere, stride: Stride = 1) -> Response:
+    """What every `stride`-th texel is, a byte each: 0 gutter, 1 valid, 2 inside geometry; 404 before it is known."""
+    job = await _job(parts, job_id)
+    if job.settings.lightmap.resolution > MOST_STATES:
+        raise NotFound("the light map is too large to tell its texels", where="lightmap.resolution")
+    return _bytes(await (await _texel_map(parts, job)).states(stride))
+
+
+@router.get("/irradiance")
+async def irradiance(
+    job_id: str,
+    parts: PartsHere,
+    tile: Annotated[list[str], Query(max_length=MOST_TILES, description="row,column of the first texel")],
+    stride: Stride = 1,
+) -> Response:
+    """float32 RGB of tiles in the order given, each whole, every `stride`-th texel of it."""
+    job = await _job(parts, job_id)
+    side = job.settings.lightmap.tile
+    if side % stride:
+        raise InputError(f"{stride} does not divide the tile's {side} texels", where="stride")
+    places = [_tile(word) for word in tile]
+    fields = LightFields(job.store_url, job.settings)
+    await fields.open()
+    return _bytes(await fields.irradiance(places, stride))
+
+
+@router.get("/texels/{row}/{column}")
+async def texel(job_id: str, row: Coordinate, column: Coordinate, parts: PartsHere) -> Response:
+    """One texel: its normal, its light field as rendered (float16 in base64), and its lobes; why what is missing is."""
+    job = await _job(parts, job_id)
+    if max(row, column) >= job.settings.lightmap.resolution:
+        raise InputError(f"the light map has no texel {row}, {column}", where="texel")
+    told: dict[str, Any] = {"row": row, "column": column, "image_size": job.settings.render.image_size, "missing": {}}
+    told["normal"] = await (await _texel_map(parts, job)).normal(row, column)
+    try:
+        fields = LightFields(job.store_url, job.settings)
+        await fields.open()
+        told["image"] = base64.b64encode(await fields.image(row, column)).decode()
+    except KilnError as error:
+        told["missing"]["image"] = error.problem().sentence()
+    try:
+        found = await views.artifact(parts.database, job_id, LIGHT_FIELD_KTX2)
+        told["lobes"] = await read_lobes(parts.blobs, found.sha256, row, column)
+    except NotFound:
+        told["missing"]["lobes"] = "The lobes can be shown once the package is there."
+    return JSONResponse(told)
+
+
+@router.get("/tiles/{row}/{column}")
+async def tile_task(job_id: str, row: Coordinate, column: Coordinate, parts: PartsHere) -> Response:
+    """The page of the task that renders a tile."""
+    async with parts.database.transaction() as tx:
+        found = await tx.maybe("tile_task", job_id=job_id, row=row, column=column)
+    if found is None:
+        raise NotFound(f"no tile begins at texel {row}, {column}", where="tile")
+    return see(f"/tasks/{found['id']}")
+
+
+async def _job(parts: Parts, job_id: str) -> JobRow:
+    async with parts.database.transaction() as tx:
+        row = await tx.maybe("find_job", id=job_id)
+    if row is None:
+        raise NotFound(f"no job '{job_id}'", where="job")
+    return JobRow.of(row)
+
+
+async def _texel_map(parts: Parts, job: JobRow) -> TexelMapReader:
+    async with parts.database.transaction() as tx:
+        row = await tx.maybe("prepared_blobs", job_id=job.id)
+    if row is None:
+        raise NotFound("the texel map is not made yet", where="prepare")
+    reader = TexelMapReader(parts.blobs, row["texel_map"], job.settings.lightmap.resolution)
+    await reader.open()
+    return reader
+
+
+def _tile(word: str) -> tuple[int, int]:
+    row, comma, column = word.partition(",")
+    if not comma or not (row + column).isascii() or not (row + column).isdigit() or max(len(row), len(column)) > 5:
+        raise InputError(f"'{word}' is not ROW,COLUMN", where="tile")
+    return int(row), int(column)
+
+
+def _bytes(data: bytes) -> Response:
+    return Response(data, media_type="application/octet-stream", headers={"Cache-Control": "no-store"})

@@ -1,0 +1,109 @@
+"""A job's page, what may be done to the job, and the pages of its tasks with their logs."""
+
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Annotated, Final, Literal
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.responses import Response
+
+from kiln_schemas.errors import InputError, NotFound
+from kiln_schemas.job import EventView, JobChange, JobView
+from kiln_schemas.operators import Scope
+from kiln_schemas.states import FINAL_JOB_STATES, JOB_TRANSITIONS, JobState
+from kiln_service import jobs, views
+from kiln_service.api.common import PartsHere, caller
+from kiln_service.auth import Principal
+from kiln_service.dashboard.jobs import stretch
+from kiln_service.dashboard.pages import Form, page, see
+from kiln_service.db import Database, TaskRow
+
+router = APIRouter(include_in_schema=False)
+
+Reader = Depends(caller(Scope.READ))
+Submitter = Annotated[Principal, Depends(caller(Scope.SUBMIT))]
+
+EVENTS: Final = 100
+TASKS: Final = 200
+"""Most that a job's page lists."""
+
+Action = Literal["pause", "resume", "cancel", "retry", "archive"]
+_DO: Final[Mapping[Action, Callable[[Database, str, str], Awaitable[None]]]] = {
+    "pause": jobs.pause,
+    "resume": jobs.resume,
+    "cancel": jobs.cancel,
+    "retry": jobs.retry,
+    "archive": jobs.archive,
+}
+_ACTIONS: Final[Mapping[Action, tuple[JobState, str, str]]] = {
+    "pause": (
+        JobState.PAUSED,
+        "Pause",
+        "Its running tasks go on to their end; no other is given to a worker.",
+    ),
+    "resume": (JobState.QUEUED, "Resume", "Its tasks are given to workers again."),
+    "cancel": (
+        JobState.CANCEL_REQUESTED,
+        "Cancel",
+        "Its running tasks are stopped. What has completed stays for a retry.",
+    ),
+    "retry": (JobState.QUEUED, "Retry", "Its unfinished tasks are done again; what has completed stays."),
+    "archive": (JobState.ARCHIVED, "Archive", "Lists leave it out from now on. Its package stays."),
+}
+"""Where each leads, its name, and what it does, for the question before it is done."""
+
+
+@router.get("/jobs/{job_id}", dependencies=[Reader])
+async def job(request: Request, job_id: str, parts: PartsHere) -> Response:
+    """All about one job."""
+    view = await views.job_view(parts.database, job_id)
+    async with parts.database.transaction() as tx:
+        tasks = await tx.all("tasks_of_note", job_id=job_id, limit=TASKS)
+        events = [EventView.model_validate(row) for row in await tx.all("last_events", job_id=job_id, limit=EVENTS)]
+    return page(
+        request,
+        "job.html",
+        job=view,
+        bars=[(stage, stretch(stage)) for stage in view.stages],
+        tasks=[views.task_view(TaskRow.of(row), row["worker"]) for row in tasks],
+        events=events,
+        artifacts=await views.artifacts(parts.database, job_id),
+        actions=_allowed(view),
+        limits={"events": EVENTS, "tasks": TASKS},
+        live=view.state not in FINAL_JOB_STATES,
+    )
+
+
+@router.post("/jobs/{job_id}/priority")
+async def rank(job_id: str, parts: PartsHere, who: Submitter, form: Form) -> Response:
+    """Rank the job anew."""
+    wanted = form.get("priority", "")
+    if not wanted.isascii() or not wanted.isdigit() or len(wanted) > 3 or int(wanted) > 100:
+        raise InputError(f"'{wanted}' is not a priority", where="priority", remedy="Give a whole number from 0 to 100.")
+    await jobs.change(parts.database, job_id, JobChange(priority=int(wanted)), who.actor)
+    return see(f"/jobs/{job_id}")
+
+
+@router.post("/jobs/{job_id}/do/{action}")
+async def act(job_id: str, action: Action, parts: PartsHere, who: Submitter, _: Form) -> Response:
+    """Pause, resume, cancel, retry or archive the job."""
+    await _DO[action](parts.database, job_id, who.actor)
+    return see(f"/jobs/{job_id}")
+
+
+@router.get("/tasks/{task_id}", dependencies=[Reader])
+async def task(request: Request, task_id: str, parts: PartsHere) -> Response:
+    """One task and its log, which a script follows while it runs."""
+    async with parts.database.transaction() as tx:
+        row = await tx.maybe("one_task", id=task_id)
+    if row is None:
+        raise NotFound(f"no task '{task_id}'", where="task")
+    view = views.task_view(TaskRow.of(row), row["worker"])
+    log = await views.task_log(parts.database, task_id)
+    return page(request, "task.html", task=view, job_id=row["job_id"], log=log)
+
+
+def _allowed(view: JobView) -> list[tuple[Action, str, str]]:
+    """What may be done to the job as it is."""
+    allowed = {action for action, (after, _, _) in _ACTIONS.items() if after in JOB_TRANSITIONS[view.state]}
+    allowed -= {"retry"} if view.state is JobState.PAUSED else {"resume"}
+    return [(action, name, does) for action, (_, name, does) in _ACTIONS.items() if action in allowed]

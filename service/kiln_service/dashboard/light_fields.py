@@ -1,0 +1,176 @@
+"""Single tiles and texels out of a job's light-field store and package, by byte ranges and without a numeric library.
+
+The layouts are those of `kiln_workers.store.layout` (Zarr v3: the irradiance has one uncompressed chunk a tile; a
+light-field shard is a tile, its chunks are texels, its index lies at the end), `kiln_workers.scene.container` (texel
+map) and KTX2 (lobes). What Zarr does not store is zero.
+"""
+
+import asyncio
+import json
+import struct
+from collections.abc import Sequence
+from typing import Any, Final
+
+import obstore
+from obstore.exceptions import BaseError
+from obstore.store import ObjectStore
+
+from kiln_schemas.conventions import ARRAY_IRRADIANCE, ARRAY_LIGHT_FIELD, LAYERS_PER_LOBE, LIGHT_FIELD_KTX2
+from kiln_schemas.errors import InputError, NotFound
+from kiln_schemas.settings import BakeSettings
+from kiln_service.blobs import Blobs, open_objects
+
+CRC_BYTES: Final = 4
+INDEX_ENTRY: Final = struct.Struct("<QQ")
+ABSENT: Final = 2**64 - 1
+AT_ONCE: Final = 16
+"""Objects read at the same time."""
+HEADER_BYTES: Final = 4096
+"""Of a texel map; more than its header has."""
+MOST_LAYERS: Final = 128
+KTX2_IDENTIFIER: Final = b"\xabKTX 20\xbb\r\n\x1a\n"
+KTX2_HEAD: Final = struct.Struct("<12s9I4I2Q3Q")
+"""Identifier, format to supercompression, index, and the first level's place (KTX 2.0, 3)."""
+
+
+class LightFields:
+    """The light-field store of one job."""
+
+    def __init__(self, store_url: str, settings: BakeSettings) -> None:
+        self._url, self._settings = store_url, settings
+        self._objects: ObjectStore | None = None
+
+    async def open(self) -> None:
+        """NotFound where the store cannot be reached from the coordinator, or is gone."""
+        try:
+            self._objects = open_objects(self._url)
+            await obstore.head_async(self._objects, "zarr.json")
+        except (BaseError, OSError, ValueError) as error:
+            raise NotFound(
+                f"the coordinator cannot read the light fields ({type(error).__name__})",
+                where=self._url,
+                remedy="Mount the store on the coordinator's machine; a store whose job was collected is gone.",
+            ) from None
+
+    async def irradiance(self, tiles: Sequence[tuple[int, int]], stride: int) -> bytes:
+        """float32 RGB of every `stride`-th texel of tiles (row, column of the first texel), one after the other."""
+        gate = asyncio.Semaphore(AT_ONCE)
+
+        async def one(row: int, column: int) -> bytes:
+            async with gate:
+                return self._thinned(await self._tile(row, column), stride)
+
+        return b"".join(await asyncio.gather(*(one(row, column) for row, column in tiles)))
+
+    async def _tile(self, row: int, column: int) -> bytes:
+        size = self._settings.lightmap.tile
+        found = await self._read(self._key(ARRAY_IRRADIANCE, row, column, 1))
+        return bytes(12 * size * size) if found is None else found[: 12 * size * size]
+
+    def _thinned(self, texels: bytes, stride: int) -> bytes:
+        """Every `stride`-th texel of every `stride`-th row."""
+        size = self._settings.lightmap.tile
+        if stride == 1:
+            return texels
+        values = memoryview(texels).cast("c")
+        kept = []
+        for row in range(0, size, stride):
+            for column in range(0, size, stride):
+                start = 12 * (row * size + column)
+                kept.append(values[start : start + 12])
+        return b"".join(kept)
+
+    async def image(self, row: int, column: int) -> bytes:
+        """A texel's light field, float16 [R, R, 3]."""
+        size, side = self._settings.lightmap.tile, self._settings.render.image_size
+        wanted = 2 * 3 * side * side
+        key = self._key(ARRAY_LIGHT_FIELD, row, column, 3)
+        index_bytes = INDEX_ENTRY.size * size * size + CRC_BYTES
+        index = await self._read(key, {"suffix": index_bytes})
+        if index is None:
+            return bytes(wanted)
+        if len(index) != index_bytes:
+            raise InputError("the shard is shorter than its index", where=key)
+        offset, length = INDEX_ENTRY.unpack_from(index, INDEX_ENTRY.size * (row % size * size + column % size))
+        if offset == ABSENT:
+            return bytes(wanted)
+        if length != wanted + CRC_BYTES:
+            raise InputError(f"the texel has {length} bytes, not {wanted + CRC_BYTES}", where=key)
+        chunk = await self._read(key, (offset, offset + length))
+        return bytes(wanted) if chunk is None else chunk[:wanted]
+
+    def _key(self, array: str, row: int, column: int, inner: int) -> str:
+        size = self._settings.lightmap.tile
+        return "/".join([array, "c", str(row // size), str(column // size), *["0"] * inner])
+
+    async def _read(self, key: str, part: Any = None) -> bytes | None:
+        """An object or a part of it; None where it is not there."""
+        assert self._objects is not None
+        try:
+            found = await obstore.get_async(self._objects, key, options={"range": part} if part else None)
+            return bytes(await found.bytes_async())
+        except FileNotFoundError:
+            return None
+
+
+async def read_lobes(blobs: Blobs, sha256: str, row: int, column: int) -> list[tuple[float, ...]]:
+    """Lobes of a texel of `lightfield.ktx2`, seven numbers each; InputError where it is supercompressed."""
+    head = await _bytes(blobs, sha256, 0, KTX2_HEAD.size)
+    if len(head) < KTX2_HEAD.size or not head.startswith(KTX2_IDENTIFIER):
+        raise InputError("it is no KTX2 file", where=LIGHT_FIELD_KTX2)
+    _, _, _, width, height, _, layers, _, _, scheme, *_, offset, _, _ = KTX2_HEAD.unpack(head)
+    if scheme != 0:
+        raise InputError("the lobes are compressed", where=LIGHT_FIELD_KTX2, remedy="Download the package.")
+    if row >= height or column >= width or layers > MOST_LAYERS or layers % LAYERS_PER_LOBE:
+        raise InputError(f"{layers} layers of {width} x {height} texels are no lobes", where=LIGHT_FIELD_KTX2)
+    places = [offset + 8 * ((layer * height + row) * width + column) for layer in range(layers)]
+    if places and places[-1] + 8 > await blobs.size(sha256):
+        raise InputError("the file ends before its lobes do", where=LIGHT_FIELD_KTX2)
+    texels = [struct.unpack("<4e", part) for part in await blobs.read_parts(sha256, places, 8)]
+    pairs = zip(texels[::LAYERS_PER_LOBE], texels[1::LAYERS_PER_LOBE], strict=True)
+    return [(*axis, *amplitude[:3]) for axis, amplitude in pairs]
+
+
+class TexelMapReader:
+    """Arrays of a packed texel map, read in parts."""
+
+    def __init__(self, blobs: Blobs, sha256: str, resolution: int) -> None:
+        self._blobs, self._sha256, self._resolution = blobs, sha256, resolution
+        self._starts: dict[str, int] = {}
+
+    async def open(self) -> None:
+        """Read the header; InputError where the map is another's than that of this light map."""
+        head = await _bytes(self._blobs, self._sha256, 0, HEADER_BYTES)
+        length = int.from_bytes(head[8:16], "little")
+        try:
+            arrays = json.loads(head[16 : 16 + length])["arrays"]
+            for name in ("state", "normal"):
+                if arrays[name]["shape"][:2] != [self._resolution, self._resolution]:
+                    raise ValueError
+                self._starts[name] = 16 + length + int(arrays[name]["offset"])
+        except (ValueError, KeyError, TypeError):
+            raise InputError("the texel map does not fit the job", where=self._sha256) from None
+
+    async def states(self, stride: int) -> bytes:
+        """One byte for every `stride`-th texel of every `stride`-th row."""
+        side, start = self._resolution, self._starts["state"]
+        data = await _bytes(self._blobs, self._sha256, start, start + side * side)
+        if len(data) != side * side:
+            raise InputError("the texel map ends early", where=self._sha256)
+        return b"".join(data[row * side : (row + 1) * side : stride] for row in range(0, side, stride))
+
+    async def normal(self, row: int, column: int) -> tuple[float, ...]:
+        """The geometric normal at a texel."""
+        at = self._starts["normal"] + 12 * (row * self._resolution + column)
+        data = await _bytes(self._blobs, self._sha256, at, at + 12)
+        if len(data) != 12:
+            raise InputError("the texel map ends early", where=self._sha256)
+        return struct.unpack("<3f", data)
+
+
+async def _bytes(blobs: Blobs, sha256: str, start: int, end: int) -> bytes:
+    """Bytes start..end-1 of a blob, fewer where it ends before."""
+    end = min(end, await blobs.size(sha256))
+    if start >= end:
+        return b""
+    return (await blobs.read_parts(sha256, [start], end - start))[0]

@@ -1,0 +1,117 @@
+"""What the job's page reads of the store and the package, held against what was written there."""
+
+import base64
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kiln_workers.package import ktx2
+
+
+def test_tiles_are_told_with_their_states(home, job, rendered):
+    told = home.client.get(f"/jobs/{job}/atlas").json()
+    assert (told["resolution"], told["tile"]) == (32, 8)
+    states = [(row, column, size, told["states"][state]) for row, column, size, state in told["tiles"]]
+    assert states == [(0, 0, 8, "completed"), (0, 8, 8, "completed"), (0, 16, 8, "queued"), (0, 24, 8, "queued")]
+
+
+def test_texels_and_irradiance_are_thinned_by_a_stride(home, job, rendered):
+    for stride in (1, 2, 4, 8):
+        check_stride(home, job, rendered, stride)
+
+
+def check_stride(home, job, rendered, stride):
+    states = home.client.get(f"/jobs/{job}/texels", params={"stride": stride}).raise_for_status().content
+    np.testing.assert_array_equal(np.frombuffer(states, np.uint8), rendered.state[::stride, ::stride].reshape(-1))
+    query = {"stride": stride, "tile": ["0,8", "0,16"]}
+    reply = home.client.get(f"/jobs/{job}/irradiance", params=query).raise_for_status()
+    told = np.frombuffer(reply.content, np.float32).reshape(2, 8 // stride, 8 // stride, 3)
+    stored = rendered.store.read_irradiance()[0:8:stride, 8:16:stride]
+    np.testing.assert_array_equal(told[0], stored)
+    assert stored.any() and not told[1].any()  # the second is not rendered
+
+
+def test_a_texel_is_told_as_it_lies_in_the_store(home, job, rendered):
+    for row, column in ((0, 0), (5, 10), (7, 14)):
+        told = home.client.get(f"/jobs/{job}/texels/{row}/{column}").raise_for_status().json()
+        image = np.frombuffer(base64.b64decode(told["image"]), np.float16).reshape(32, 32, 3)
+        np.testing.assert_array_equal(image, rendered.images[row, column])
+        assert told["normal"] == pytest.approx([0.0, 0.6, 0.8]) and "package" in told["missing"]["lobes"]
+    gutter = home.client.get(f"/jobs/{job}/texels/0/7").json()  # within a shard
+    unknown = home.client.get(f"/jobs/{job}/texels/20/20").json()  # no shard
+    assert not any(base64.b64decode(gutter["image"])) and not any(base64.b64decode(unknown["image"]))
+
+
+def test_lobes_are_read_from_the_package(home, job, rendered, tmp_path):
+    folder = tmp_path / "package"
+    folder.mkdir()
+    lobes = next(file for file in rendered.artifacts(folder) if file["name"] == "lightfield.ktx2")
+    home.sql("INSERT INTO artifacts VALUES (%s, 'lightfield.ktx2', %s, 1, 'image/ktx2')", job, lobes["sha256"])
+    told = home.client.get(f"/jobs/{job}/texels/31/30").json()
+    np.testing.assert_array_equal(np.float32(told["lobes"]), rendered.lobes[31, 30])
+    texture = ktx2.texture_array(np.zeros((2, 32, 32, 4), np.float16), {})
+    ktx2.write(tmp_path / "small.ktx2", texture, supercompress=True)
+    head = (folder / "lightfield.ktx2").read_bytes()[:104]
+    for data, sentence in (
+        ((tmp_path / "small.ktx2").read_bytes(), "the lobes are compressed"),
+        (b"not a texture", "is no KTX2 file"),
+        (head + bytes(1000), "ends before its lobes"),
+    ):
+        home.sql("UPDATE artifacts SET sha256 = %s", home.upload(data))
+        reply = home.client.get(f"/jobs/{job}/texels/1/1")
+        assert reply.status_code == 422 and sentence in reply.json()["detail"], reply.text
+
+
+def test_a_store_that_is_gone_is_a_sentence(home, job, rendered):
+    shutil.rmtree(rendered.store.url.removeprefix("file://"))
+    reply = home.client.get(f"/jobs/{job}/irradiance", params={"tile": "0,0"})
+    assert reply.status_code == 404 and "cannot read the light fields" in reply.json()["detail"]
+    assert "Mount the store" in reply.json()["remedy"]
+    told = home.client.get(f"/jobs/{job}/texels/1/1").raise_for_status().json()
+    assert "image" not in told and "cannot read the light fields" in told["missing"]["image"]
+
+
+def test_a_damaged_shard_is_a_sentence(home, job, rendered):
+    folder = rendered.store.url.removeprefix("file://")
+    with Path(folder, "light_field/c/0/0/0/0/0").open("r+b") as shard:
+        shard.seek(-(16 * 64 + 4), 2)
+        shard.write((0).to_bytes(8, "little") + (2**40).to_bytes(8, "little"))
+    told = home.client.get(f"/jobs/{job}/texels/0/0").raise_for_status().json()
+    assert "the texel has 1099511627776 bytes" in told["missing"]["image"]
+
+
+def test_a_texel_map_of_something_else_is_a_sentence(home, job, rendered):
+    header = json.dumps({"arrays": {"state": {"shape": [10**9, 10**9], "offset": 0}}}).encode()
+    for data in (b"", b"KILNARR1", b"KILNARR1" + len(header).to_bytes(8, "little") + header):
+        result = json.dumps(home.upload(data))
+        home.sql("UPDATE tasks SET result = jsonb_set(result, '{texel_map}', %s) WHERE kind = 'prepare'", result)
+        reply = home.client.get(f"/jobs/{job}/texels")
+        assert reply.status_code == 422 and "does not fit the job" in reply.json()["detail"]
+
+
+def test_what_makes_no_sense_is_refused(home, job):
+    for path, status in {
+        "irradiance": 422,
+        "irradiance?tile=1": 422,
+        "irradiance?tile=-1,0": 422,
+        "irradiance?tile=0,%2E%2E": 422,
+        "irradiance?tile=0,0&stride=3": 422,
+        "irradiance?" + "&".join(["tile=0,0"] * 300): 422,
+        "texels?stride=0": 422,
+        "texels/32/0": 422,
+        "texels/99999/0": 422,
+        "tiles/0/1": 404,
+        "do/explode": 405,
+    }.items():
+        reply = home.client.get(f"/jobs/{job}/{path}")
+        assert reply.status_code == status, (path, reply.text)
+        assert reply.headers["content-type"] == "application/problem+json"
+
+
+def test_an_unknown_job_has_no_pages(shared):
+    for path in ("", "/atlas", "/texels", "/irradiance?tile=0,0", "/texels/0/0", "/tiles/0/0"):
+        reply = shared.client.get(f"/jobs/nobody{path}", headers={"Accept": "text/html"})
+        assert reply.status_code == 404 and "<h1>Not found</h1>" in reply.text
