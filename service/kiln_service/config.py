@@ -66,8 +66,8 @@ class Limits(Contract):
 class Timing(Contract):
     """Intervals in seconds."""
 
-    heartbeat_s: float = Field(default=5.0, gt=0)
-    """Told to workers: beat at least this often while a task runs."""
+    heartbeat_s: float = Field(default=3.0, gt=0)
+    """Told to workers: beat this often while a task runs. A canceled task has stopped after this and two seconds."""
     stale_s: float = Field(default=30.0, gt=0)
     """A running task without a heartbeat for this long has lost its worker."""
     poll_s: float = Field(default=1.0, gt=0)
