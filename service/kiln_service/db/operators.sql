@@ -111,10 +111,18 @@ SELECT kind, count(*) AS events FROM events WHERE kind = ANY(%(kinds)s) GROUP BY
 SELECT COALESCE(sum(size), 0)::bigint AS bytes, count(*) AS blobs FROM blobs;
 
 -- name: find_freeable
--- Archived jobs that ended before `days` ago and whose data is still there, oldest first.
+-- Archived jobs that ended before `days` ago, have none of the labels and whose data is still there, oldest first.
 SELECT id FROM jobs
 WHERE state = 'archived' AND freed IS NULL AND finished < now() - make_interval(secs => %(days)s * 86400.0)
+  AND NOT EXISTS (SELECT FROM jsonb_each_text(%(keep)s) AS kept WHERE jobs.labels ->> kept.key = kept.value)
 ORDER BY id;
+
+-- name: find_archivable
+-- Jobs in one of the states that ended before `days` ago and have none of the labels, oldest first.
+SELECT id FROM jobs
+WHERE state = ANY(%(states)s) AND finished < now() - make_interval(secs => %(days)s * 86400.0)
+  AND NOT EXISTS (SELECT FROM jsonb_each_text(%(keep)s) AS kept WHERE jobs.labels ->> kept.key = kept.value)
+ORDER BY id LIMIT 1000;
 
 -- name: stores_needed_by_others
 -- Which of these stores jobs read that are not freed; the job itself apart.
