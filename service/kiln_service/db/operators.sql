@@ -82,15 +82,11 @@ SELECT kind, state, count(*) AS tasks FROM tasks GROUP BY kind, state;
 SELECT state, count(*) AS jobs FROM jobs GROUP BY state;
 
 -- name: sum_work
--- Completed attempts by kind, and what tiles rendered.
-SELECT kind, count(*) AS tasks, COALESCE(sum((result ->> 'paths')::float8), 0) AS paths,
-       COALESCE(sum((spec -> 'tile' ->> 'texels')::float8), 0) AS texels
-FROM tasks WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind;
-
--- name: seconds_of_tasks
--- Completed attempts by kind and by the number of the bounds, in seconds, that each took longer than.
+-- Completed attempts by kind and by how many of the bounds, in seconds, each took longer than; what tiles rendered.
 SELECT kind, width_bucket((result ->> 'seconds')::float8, %(bounds)s::float8[]) AS bucket, count(*) AS tasks,
-       sum((result ->> 'seconds')::float8) AS seconds
+       sum((result ->> 'seconds')::float8) AS seconds,
+       COALESCE(sum((result ->> 'paths')::float8), 0) AS paths,
+       COALESCE(sum((spec -> 'tile' ->> 'texels')::float8), 0) AS texels
 FROM tasks WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind, bucket;
 
 -- name: sum_light_fields
