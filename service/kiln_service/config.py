@@ -91,6 +91,19 @@ class FailedTasks(Contract):
     """and more than this share of all tasks of the kind."""
 
 
+class Retention(Contract):
+    """How long jobs that are over keep what they have; nothing goes where no days are given."""
+
+    archive_days: float | None = Field(default=None, ge=0)
+    """A job is archived so many days after its end."""
+    free_days: float | None = Field(default=None, ge=0)
+    """An archived job gives up its light fields so many days after its end; its package stays."""
+    keep: dict[str, str] = Field(default={"keep": "true"})
+    """Jobs with one of these labels are left alone."""
+    check_s: float = Field(default=3600.0, gt=0)
+    """Seconds between two rounds."""
+
+
 class ServiceConfig(Contract):
     """A coordinator. Without `database` an embedded PostgreSQL is run in `<data>/postgres`."""
 
@@ -115,6 +128,7 @@ class ServiceConfig(Contract):
     """Database connections."""
     limits: Limits = Limits()
     timing: Timing = Timing()
+    retention: Retention = Retention()
 
     @field_validator("storage_url", "store_url", "blob_url")
     @classmethod
