@@ -1,12 +1,13 @@
 # make demo   bake a bundled example and say where the results are
 # make test   everything that has to hold
 # make lint   the static part of it
+# make hostile   the long run of schemathesis over the interface
 # make venv   the virtual environment in .venv that these use
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint node chromium clean
+.PHONY: help venv demo test hostile lint node chromium clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -40,6 +41,9 @@ chromium:
 
 test: lint node chromium
 	$(BIN)/pytest
+
+hostile: venv
+	LIGHTKILN_HOSTILE_EXAMPLES=400 $(BIN)/pytest tests/hostile/test_openapi.py -q -rP
 
 clean:
 	rm -rf $(VENV) demo demo.partial

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# venv.sh DIR EXTRAS: a virtual environment in DIR with lightkiln[EXTRAS] in editable form, at the pinned versions.
+# venv.sh DIR EXTRAS [--copy]: a virtual environment in DIR with lightkiln[EXTRAS] at the pinned versions, in editable
+# form or, with --copy, without need of this folder afterwards (the images).
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 root=$(cd "$here/../.." && pwd)
@@ -7,6 +8,10 @@ root=$(cd "$here/../.." && pwd)
 
 venv=$1
 extras=$2
+form=(-e)
+if [ "${3:-}" = --copy ]; then
+    form=()
+fi
 
 # The oldest supported Python first: it is what everything is tested with.
 find_python() {
@@ -29,4 +34,4 @@ if ! [ -x "$venv/bin/python" ] || ! "$venv/bin/python" -m pip --version >/dev/nu
     "$python" -m venv --clear "$venv"
 fi
 sentence "installing lightkiln[$extras] into $venv (some minutes the first time)"
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c "$root/constraints.txt" -e "$root[$extras]"
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c "$root/constraints.txt" "${form[@]}" "$root[$extras]"

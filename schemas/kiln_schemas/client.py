@@ -16,8 +16,17 @@ from urllib.parse import quote
 import httpx
 from pydantic import TypeAdapter
 
-from kiln_schemas.errors import AuthError, Unreachable, error_of_answer
-from kiln_schemas.job import JobChange, JobPage, JobRequest, JobView, MissingReply, MissingRequest, TaskView
+from kiln_schemas.errors import AuthError, KilnError, TooMany, Unreachable, error_of_answer, wait_asked
+from kiln_schemas.job import (
+    JobChange,
+    JobPage,
+    JobRequest,
+    JobView,
+    MissingReply,
+    MissingRequest,
+    RequeueRequest,
+    TaskView,
+)
 from kiln_schemas.operators import (
     DeliveryView,
     GcReport,
@@ -25,6 +34,7 @@ from kiln_schemas.operators import (
     NewToken,
     NewWebhook,
     Order,
+    SleepSchedule,
     TokenRequest,
     TokenView,
     WebhookRequest,
@@ -36,7 +46,8 @@ from kiln_schemas.tasks import Artifact, TaskKind
 
 CHUNK: Final = 1 << 20
 PAUSE_S: Final = (0.1, 2.0)
-AWAY: Final = frozenset({502, 503, 504})
+AWAY: Final = frozenset({TooMany.status, 502, 503, 504})
+"""Statuses of an answer after which the call is repeated, not before its Retry-After."""
 MISSING_AT_ONCE: Final = 4096
 OnBytes = Callable[[int], None]
 
@@ -116,6 +127,12 @@ class Client:
         """Ask something of a job."""
         return JobView.model_validate_json(self._call("POST", f"/v1/jobs/{quote(job_id, safe='')}/{action}").content)
 
+    def requeue(self, job_id: str, wanted: RequeueRequest) -> JobView:
+        """Do tasks again that are done, and what follows from them."""
+        body = wanted.model_dump(mode="json", exclude_none=True)
+        path = f"/v1/jobs/{quote(job_id, safe='')}/requeue"
+        return JobView.model_validate_json(self._call("POST", path, json=body).content)
+
     def change(self, job_id: str, wanted: JobChange) -> JobView:
         """Rank or label a job anew."""
         body = wanted.model_dump(mode="json", exclude_none=True)
@@ -128,6 +145,18 @@ class Client:
     def order_worker(self, worker_id: str, order: Order) -> None:
         """Tell a worker to sleep, to wake or to leave."""
         self._call("POST", f"/v1/workers/{quote(worker_id, safe='')}/orders/{order.value}")
+
+    def unblock_worker(self, worker_id: str) -> None:
+        """Let a worker take tasks of all jobs again."""
+        self._call("DELETE", f"/v1/workers/{quote(worker_id, safe='')}/blocks")
+
+    def set_schedule(self, worker: str, schedule: SleepSchedule | None) -> None:
+        """Let workers of a name sleep at given times, or only when they are told to."""
+        path = f"/v1/schedules/{quote(worker, safe='')}"
+        if schedule is None:
+            self._call("DELETE", path)
+        else:
+            self._call("PUT", path, json=schedule.model_dump(mode="json"))
 
     def tokens(self) -> tuple[TokenView, ...]:
         """Access tokens that were made, without themselves."""
@@ -165,9 +194,24 @@ class Client:
         reply = self._call("GET", f"/v1/webhooks/{quote(webhook_id, safe='')}/deliveries")
         return TypeAdapter(tuple[DeliveryView, ...]).validate_json(reply.content)
 
-    def task_log(self, task_id: str) -> str:
-        """What the attempts of a task wrote."""
-        return self._call("GET", f"/v1/tasks/{quote(task_id, safe='')}/log").text
+    def task_log(self, task_id: str, tail: int | None = None) -> str:
+        """What the attempts of a task wrote, or the last `tail` lines of it."""
+        params = {} if tail is None else {"tail": tail}
+        return self._call("GET", f"/v1/tasks/{quote(task_id, safe='')}/log", params=params).text
+
+    def follow_log(self, task_id: str, tail: int | None = None) -> Iterator[str]:
+        """The same in pieces, and what is written until the task is over."""
+        path = f"/v1/tasks/{quote(task_id, safe='')}/log"
+        params: dict[str, Any] = {"follow": True} | ({} if tail is None else {"tail": tail})
+        quiet = httpx.Timeout(60.0, connect=5.0, read=None)
+        try:
+            with self._http.stream("GET", path, params=params, timeout=quiet) as response:
+                if not response.is_success:
+                    raise error_of_answer(response.read(), response.status_code, f"GET {path}", self.url)
+                yield from response.iter_text()
+        except httpx.TransportError as error:
+            reason = str(error) or type(error).__name__
+            raise Unreachable(f"the log broke off ({reason})", where=self.url, remedy="Ask for it again.") from None
 
     def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
         """What a job published."""
@@ -217,6 +261,7 @@ class Client:
         """The first answer that is not an outage; the coordinator's errors are raised."""
         deadline, pause = time.monotonic() + self._patience_s, PAUSE_S[0]
         while True:
+            response: httpx.Response | None = None
             try:
                 response = attempt()
             except httpx.UnsupportedProtocol as error:
@@ -229,10 +274,12 @@ class Client:
                 if response.is_success:
                     return response
                 if response.status_code not in AWAY:
-                    asked = f"{response.request.method} {response.request.url.path}"
-                    raise error_of_answer(response.content, response.status_code, asked, self.url)
+                    raise self._error(response)
                 reason = f"it answers {response.status_code}"
+                pause = max(pause, wait_asked(response.headers.get("retry-after")))
             if time.monotonic() + pause > deadline:
+                if response is not None and response.status_code == TooMany.status:
+                    raise self._error(response)
                 raise Unreachable(
                     f"the coordinator does not answer ({reason})",
                     where=self.url,
@@ -240,6 +287,10 @@ class Client:
                 )
             time.sleep(pause)
             pause = min(2 * pause, PAUSE_S[1])
+
+    def _error(self, response: httpx.Response) -> KilnError:
+        asked = f"{response.request.method} {response.request.url.path}"
+        return error_of_answer(response.content, response.status_code, asked, self.url)
 
 
 def _pieces(path: Path, on_bytes: OnBytes) -> Iterator[bytes]:

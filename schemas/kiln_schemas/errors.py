@@ -6,6 +6,7 @@
     |   `-- Truncated       an upload ended early (400, exit 3)
     |-- AuthError           no token, or a wrong one (401, exit 6)
     |-- Forbidden           the token lacks the scope (403, exit 6)
+    |-- TooMany             the caller asks too often (429, exit 6)
     |-- NotFound            no such job, task, blob or artifact (404, exit 3)
     |-- Conflict            the request contradicts the present state (409, exit 4)
     |   |-- StaleAttempt    a worker acts under an attempt that was taken from it
@@ -27,6 +28,7 @@ from typing import ClassVar, Final, Self
 from pydantic import ValidationError
 
 from kiln_schemas.base import Contract
+from kiln_schemas.text import Place, Told
 
 DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """`OSError.errno` of a disk, a quota or a file at its limit; told as MachineLacks wherever files are written."""
@@ -38,12 +40,12 @@ class Problem(Contract):
     type: str = "about:blank"
     title: str
     status: int
-    detail: str
+    detail: Told
     code: str
     """Stable slug for programs: `input`, `fit-failed`, `stale-attempt`, ..."""
-    where: str | None = None
+    where: Place | None = None
     """The mesh, file or field at fault."""
-    remedy: str | None = None
+    remedy: Told | None = None
     """What the user can do about it."""
 
     def sentence(self) -> str:
@@ -112,6 +114,20 @@ class Forbidden(KilnError):
     code, title, status, exit_code = "forbidden", "The token lacks the scope", 403, 6
 
 
+class TooMany(KilnError):
+    """`wait_s`: seconds until the next request is taken."""
+
+    code, title, status, exit_code, retryable = "too-many-requests", "The caller asks too often", 429, 6, True
+
+    def __init__(
+        self, detail: str, *, where: str | None = None, remedy: str | None = None, wait_s: int | None = None
+    ) -> None:
+        if wait_s is not None and remedy is None:
+            remedy = f"Ask again in {wait_s} s; limits.rates of the coordinator says how often is allowed."
+        super().__init__(detail, where=where, remedy=remedy)
+        self.wait_s = wait_s
+
+
 class NotFound(KilnError):
     code, title, status, exit_code = "not-found", "Not found", 404, 3
 
@@ -158,6 +174,11 @@ class MachineLacks(KilnError):
 
 class InternalError(KilnError):
     code, title, status, exit_code, retryable = "internal", "A defect in lightkiln", 500, 1, True
+
+
+def wait_asked(retry_after: str | None) -> float:
+    """Seconds that a Retry-After header asks to wait; 0 where there is none, or it names a time."""
+    return float(retry_after) if retry_after is not None and retry_after.strip().isdecimal() else 0.0
 
 
 def error_of_answer(body: bytes, status: int, request: str, where: str) -> KilnError:

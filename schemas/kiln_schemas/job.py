@@ -3,7 +3,8 @@
 import re
 from collections.abc import Sequence
 from datetime import datetime
-from typing import Annotated, Any, Final
+from pathlib import PurePosixPath
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field
 
@@ -12,22 +13,25 @@ from kiln_schemas.errors import InputError, Problem
 from kiln_schemas.gates import Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
-from kiln_schemas.tasks import Bundle, Progress, Sha256, TaskKind
+from kiln_schemas.tasks import PATH_LENGTH, Bundle, Progress, Sha256, Tags, TaskKind
+from kiln_schemas.text import LINE_BREAK, UNFIT, Line, told
 
 DEFAULT_PRIORITY: Final = 50
 
 Priority = Annotated[int, Field(ge=0, le=100, description="of two jobs that wait the greater goes first")]
 LABEL_KEY: Final = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,62}$"
 LABEL_LENGTH: Final = 128
+PART_BYTES: Final = 255
+"""Longest name of a file or folder on the file systems in use."""
 LabelKey = Annotated[str, Field(pattern=LABEL_KEY)]
-LabelValue = Annotated[str, Field(max_length=LABEL_LENGTH)]
+LabelValue = Annotated[Line, Field(max_length=LABEL_LENGTH)]
 Labels = Annotated[dict[LabelKey, LabelValue], Field(max_length=32)]
 
 
 class JobRequest(Contract):
     """Body of `POST /v1/jobs`: a preset with overrides, or complete settings."""
 
-    name: str = Field(min_length=1, max_length=128)
+    name: Line = Field(min_length=1, max_length=128)
     bundle: Bundle
     preset: str | None = None
     set: tuple[str, ...] = Field(default=(), max_length=256)
@@ -38,6 +42,8 @@ class JobRequest(Contract):
     priority: Priority = DEFAULT_PRIORITY
     labels: Labels = Field(default_factory=dict)
     """Free words to find the job by: project, shot, commit, ..."""
+    tags: Tags = ()
+    """Its tasks go to workers that have all of these tags."""
 
 
 class JobChange(Contract):
@@ -46,6 +52,26 @@ class JobChange(Contract):
     priority: Priority | None = None
     labels: Labels | None = None
     """All labels from now on."""
+    tags: Tags | None = None
+    """All tags that its workers need from now on."""
+
+
+TexelRange = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]]
+
+
+class RequeueRequest(Contract):
+    """Body of `POST /v1/jobs/{id}/requeue`: which tasks to do again, though they are done; all of the kind by default.
+
+    What follows from them waits for them and is done again too, and the package with it.
+    """
+
+    kind: Literal[TaskKind.RENDER, TaskKind.FIT, TaskKind.REFINE, TaskKind.PACKAGE]
+    rows: TexelRange | None = None
+    """Only tiles or blocks with texels in these rows of the light map: the first, and the one after the last."""
+    columns: TexelRange | None = None
+    """The same of columns."""
+    labels: tuple[str, ...] | None = Field(default=None, max_length=4096)
+    """Only tasks with these labels."""
 
 
 class StageView(Contract):
@@ -56,6 +82,8 @@ class StageView(Contract):
     completed: int
     active: int
     failed: int
+    soft_failed: int = 0
+    """Of those that are queued: after attempts that ended badly."""
     fraction: float
     """0..1, running tasks counted by their own progress."""
     seconds: float
@@ -82,6 +110,7 @@ class JobView(Contract):
     """Empty until the package has been measured."""
     priority: int = DEFAULT_PRIORITY
     labels: dict[str, str] = Field(default_factory=dict)
+    tags: tuple[str, ...] = ()
     submitter: str | None = None
     """Name of the token it was submitted with."""
     renders_of: str | None = None
@@ -161,12 +190,21 @@ def read_labels(words: Sequence[str], where: str = "--label") -> dict[str, str]:
 
 
 def check_bundle_path(path: str) -> str:
-    """A relative POSIX path that stays inside its bundle, unchanged; InputError otherwise."""
+    """A relative POSIX path that stays inside its bundle and names a file anywhere, unchanged; InputError otherwise."""
     parts = path.split("/")
+    if UNFIT.search(path) or LINE_BREAK.search(path):
+        raise InputError(
+            f"'{path}' holds a control character", where="bundle.files", remedy="Give the file another name."
+        )
+    if len(path) > PATH_LENGTH or any(len(part.encode()) > PART_BYTES for part in parts):
+        raise InputError(
+            f"'{told(path, 80)}' is longer than {PATH_LENGTH} characters, or {PART_BYTES} bytes between two slashes",
+            where="bundle.files",
+            remedy="Give the file a shorter name.",
+        )
     if (
         path.startswith("/")
         or "\\" in path
-        or "\0" in path
         or any(part in ("", ".", "..") for part in parts)
         or (len(parts[0]) > 1 and parts[0][1] == ":")
     ):
@@ -182,6 +220,11 @@ def check_bundle(bundle: Bundle) -> Bundle:
     """The bundle unchanged, if every path stays inside and entry and environment are among its files."""
     for path in bundle.files:
         check_bundle_path(path)
+    folders = {parent.as_posix() for path in bundle.files for parent in PurePosixPath(path).parents}
+    if both := sorted(folders & set(bundle.files)):
+        raise InputError(
+            f"'{both[0]}' is a file and a folder", where="bundle.files", remedy="Give the file another name."
+        )
     wanted = {"bundle.entry": bundle.entry}
     if bundle.environment:
         wanted["bundle.environment.file"] = bundle.environment.file

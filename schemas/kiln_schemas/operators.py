@@ -1,12 +1,14 @@
 """What operators ask of a coordinator and what it tells them: workers, access tokens, the record of who did what."""
 
-from datetime import datetime
+from datetime import datetime, time
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Final, Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, field_validator
 
 from kiln_schemas.base import Contract
+from kiln_schemas.receivers import check_receiver
 from kiln_schemas.tasks import TaskKind
 
 
@@ -32,6 +34,8 @@ class WorkerState(StrEnum):
     """Told to take no task until it is woken."""
     DRAINING = "draining"
     """Told to leave once its task is done."""
+    ERROR = "error"
+    """Its last three attempts or more all ended badly; it goes on asking."""
     OFFLINE = "offline"
     """Not heard of for a minute."""
 
@@ -45,6 +49,45 @@ class Order(StrEnum):
     """Finish the task at hand and take no other until it is woken."""
     DRAIN = "drain"
     """Finish the task at hand and leave: its process ends."""
+
+
+DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+
+
+class SleepSchedule(Contract):
+    """Body of `PUT /v1/schedules/{worker}`: when a worker takes no tasks. What it has then it ends."""
+
+    days: tuple[Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"], ...] = Field(min_length=1, max_length=7)
+    """Days on which the span begins."""
+    begins: time
+    ends: time
+    """Where this is not after `begins`, the span ends on the next day."""
+    timezone: str = Field(default="UTC", max_length=64)
+    """IANA name, as in `Europe/Stockholm`."""
+
+    @field_validator("timezone")
+    @classmethod
+    def _is_known(cls, name: str) -> str:
+        try:
+            ZoneInfo(name)
+        except (ZoneInfoNotFoundError, ValueError, OSError):
+            raise ValueError(f"no time zone '{name}' is known") from None
+        return name
+
+    @field_validator("begins", "ends")
+    @classmethod
+    def _is_local(cls, value: time) -> time:
+        if value.tzinfo is not None:
+            raise ValueError("is a time of the day in `timezone`, without a zone of its own")
+        return value
+
+
+class BlockView(Contract):
+    """A worker gets no tasks of a kind of a job, since it failed some."""
+
+    job_id: str
+    kind: TaskKind
+    until: datetime
 
 
 class WorkerView(Contract):
@@ -62,6 +105,11 @@ class WorkerView(Contract):
     job_id: str | None = None
     task: str | None = None
     """Kind and label of the task at hand."""
+    tags: tuple[str, ...] = ()
+    schedule: SleepSchedule | None = None
+    """When workers of its name sleep."""
+    blocks: tuple[BlockView, ...] = ()
+    """Of workers of its name."""
 
 
 TokenName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
@@ -106,7 +154,10 @@ class JobEvent(StrEnum):
 class WebhookRequest(Contract):
     """Body of `POST /v1/webhooks`."""
 
-    url: Annotated[str, Field(pattern=r"^https?://[^\s/@]+(/[^\s]*)?$", max_length=2048)]
+    url: Annotated[
+        str, Field(pattern=r"^https?://[!-.0-?A-~]+(/[!-~]*)?$", max_length=2048), AfterValidator(check_receiver)
+    ]
+    """Without a user or a password; which hosts are refused: `kiln_schemas.receivers`."""
     events: tuple[JobEvent, ...] = Field(
         default=(JobEvent.COMPLETED, JobEvent.GATE_FAILED, JobEvent.FAILED, JobEvent.CANCELED),
         min_length=1,

@@ -1,8 +1,10 @@
 """States of jobs and tasks and the only moves between them.
 
-Tasks: waiting > queued > active > completed | failed | canceled; a lost or failed attempt moves active > queued.
+Tasks: waiting > queued > active > completed | failed | canceled; an attempt that is lost or fails moves
+active > soft-failed, from where another worker takes it (soft-failed > active).
 Jobs: queued > active > completed | gate-failed | failed, or cancel-requested > canceled; paused and back; whatever
-is over may be archived. A retried job is queued again, and its failed and canceled tasks wait or queue again.
+is over may be archived. A retried job is queued again, and its failed and canceled tasks wait or queue again; so
+is one of which a person has tasks done again, and what follows from those waits for them.
 """
 
 from collections.abc import Mapping
@@ -26,7 +28,7 @@ class JobState(StrEnum):
     CANCELED = "canceled"
     """Stopped on request; no task runs. Over, unless it is retried."""
     FAILED = "failed"
-    """A task failed for good; its error is the job's. Over, unless it is retried."""
+    """A task failed for good, and nothing is left that goes without it; its error is the job's. Over unless retried."""
     COMPLETED = "completed"
     """All artifacts are published, and every quality gate is met. Over."""
     GATE_FAILED = "gate-failed"
@@ -42,10 +44,12 @@ class TaskState(StrEnum):
     """Planned; the tasks that it depends on have not all completed."""
     QUEUED = "queued"
     """Any worker of its kind may claim it."""
+    SOFT_FAILED = "soft-failed"
+    """Queued again after attempts that ended badly: first for workers that have not failed it."""
     ACTIVE = "active"
     """Claimed by one worker under the current attempt."""
     FAILED = "failed"
-    """Out of attempts, or failed in a way that no other attempt mends. Over, unless its job is retried."""
+    """Out of attempts, or failed in a way that no other attempt mends. Over, unless it is retried."""
     CANCELED = "canceled"
     """Stopped with its job. Over, unless that is retried."""
     COMPLETED = "completed"
@@ -66,24 +70,36 @@ JOB_TRANSITIONS: Final[Mapping[JobState, frozenset[JobState]]] = {
     JobState.CANCEL_REQUESTED: frozenset({JobState.CANCELED}),
     JobState.CANCELED: frozenset({JobState.QUEUED, JobState.ARCHIVED}),
     JobState.FAILED: frozenset({JobState.QUEUED, JobState.ARCHIVED}),
-    JobState.COMPLETED: frozenset({JobState.ARCHIVED}),
-    JobState.GATE_FAILED: frozenset({JobState.ARCHIVED}),
+    JobState.COMPLETED: frozenset({JobState.QUEUED, JobState.ARCHIVED}),
+    JobState.GATE_FAILED: frozenset({JobState.QUEUED, JobState.ARCHIVED}),
     JobState.ARCHIVED: frozenset(),
 }
 
 TASK_TRANSITIONS: Final[Mapping[TaskState, frozenset[TaskState]]] = {
     TaskState.WAITING: frozenset({TaskState.QUEUED, TaskState.COMPLETED, TaskState.CANCELED}),
-    TaskState.QUEUED: frozenset({TaskState.ACTIVE, TaskState.CANCELED}),
-    TaskState.ACTIVE: frozenset({TaskState.QUEUED, TaskState.COMPLETED, TaskState.FAILED, TaskState.CANCELED}),
-    TaskState.FAILED: frozenset({TaskState.QUEUED}),
+    TaskState.QUEUED: frozenset({TaskState.ACTIVE, TaskState.CANCELED, TaskState.WAITING}),
+    TaskState.SOFT_FAILED: frozenset({TaskState.ACTIVE, TaskState.QUEUED, TaskState.CANCELED, TaskState.WAITING}),
+    TaskState.ACTIVE: frozenset(
+        {
+            *(TaskState.QUEUED, TaskState.SOFT_FAILED, TaskState.WAITING),
+            *(TaskState.COMPLETED, TaskState.FAILED, TaskState.CANCELED),
+        }
+    ),
+    TaskState.FAILED: frozenset({TaskState.QUEUED, TaskState.WAITING}),
     TaskState.CANCELED: frozenset({TaskState.WAITING, TaskState.QUEUED}),
-    TaskState.COMPLETED: frozenset(),
+    TaskState.COMPLETED: frozenset({TaskState.QUEUED, TaskState.WAITING}),
 }
 
 LIVE_JOB_STATES: Final = frozenset({JobState.QUEUED, JobState.ACTIVE, JobState.PAUSED})
 """Those in which what a worker has of the job is wanted."""
 FINAL_JOB_STATES: Final = frozenset(JobState) - LIVE_JOB_STATES - {JobState.CANCEL_REQUESTED}
 """Those of a job that is over: nothing happens to it any more unless somebody asks."""
+CLAIMABLE_TASK_STATES: Final = frozenset({TaskState.QUEUED, TaskState.SOFT_FAILED})
+"""Those in which a worker may claim a task."""
+OPEN_TASK_STATES: Final = CLAIMABLE_TASK_STATES | {TaskState.ACTIVE}
+"""Those in which a job goes on because of a task."""
+OVER_TASK_STATES: Final = frozenset({TaskState.FAILED, TaskState.CANCELED, TaskState.COMPLETED})
+"""Those of a task that nobody works on unless somebody asks."""
 PUBLISHED_JOB_STATES: Final = frozenset({JobState.COMPLETED, JobState.GATE_FAILED})
 """Those in which a job has artifacts; an archived one may have some."""
 

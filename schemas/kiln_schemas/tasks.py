@@ -4,18 +4,24 @@ All data between tasks travel as content-addressed blobs through the coordinator
 light-field store, which workers write and read directly at `store_url`.
 """
 
+from collections.abc import Sequence
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter, ValidationError
 
 from kiln_schemas.base import Contract
-from kiln_schemas.errors import Problem
+from kiln_schemas.errors import InputError, Problem
 from kiln_schemas.gates import Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings, Function
+from kiln_schemas.text import Line, Log, Note
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-BundlePath = Annotated[str, Field(min_length=1, max_length=512)]
+PATH_LENGTH: Final = 512
+BundlePath = Annotated[str, Field(min_length=1, max_length=PATH_LENGTH)]
+Number = Annotated[int, Field(ge=0, lt=2**31)]
+"""A count or an index that the database holds in 32 bits."""
+Bytes = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 class TaskKind(StrEnum):
@@ -48,18 +54,18 @@ class Bundle(Contract):
 class Block(Contract):
     """A square of the light map that is refined as one task: first row and column, texels along each side."""
 
-    row: int = Field(ge=0)
-    column: int = Field(ge=0)
-    size: int = Field(ge=1)
+    row: Number
+    column: Number
+    size: int = Field(ge=1, lt=2**31)
 
 
 class Tile(Contract):
     """A square of the light map: first row and column, texels along each side, texels that have a surface point."""
 
-    row: int = Field(ge=0)
-    column: int = Field(ge=0)
-    size: int = Field(ge=1)
-    texels: int = Field(ge=0)
+    row: Number
+    column: Number
+    size: int = Field(ge=1, lt=2**31)
+    texels: Number
 
 
 class PreparePayload(Contract):
@@ -139,7 +145,7 @@ class PrepareResult(Contract):
     has_environment: bool
     has_light: bool
     triangles: int
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     """What was decided for the user: per-mesh unwrapping, ignored features, dropped faces."""
     seconds: float
 
@@ -197,10 +203,13 @@ class RefineResult(Contract):
 
 
 class Artifact(Contract):
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", max_length=200)]
+    name: Annotated[
+        str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*(/[A-Za-z0-9_-][A-Za-z0-9_.-]*)*$", max_length=200)
+    ]
+    """No part begins with a dot, so that none leads out of a folder or hides in it."""
     sha256: Sha256
-    size: int = Field(ge=0)
-    media_type: str
+    size: Bytes
+    media_type: Annotated[str, Field(pattern=r"^[a-z0-9.+-]+/[a-z0-9.+-]+(; charset=utf-8)?$", max_length=100)]
 
 
 class PackageResult(Contract):
@@ -224,13 +233,19 @@ class Progress(Contract):
     loss: float | None = None
 
 
+Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$")]
+Tags = Annotated[tuple[Tag, ...], Field(max_length=32)]
+
+
 class WorkerRegistration(Contract):
-    name: str = Field(min_length=1, max_length=128)
-    kinds: tuple[TaskKind, ...] = Field(min_length=1)
-    memory_bytes: int = Field(gt=0)
-    threads: int = Field(gt=0)
-    device: str
-    version: str
+    name: Line = Field(min_length=1, max_length=128)
+    kinds: tuple[TaskKind, ...] = Field(min_length=1, max_length=32)
+    memory_bytes: int = Field(gt=0, lt=2**63)
+    threads: int = Field(gt=0, lt=2**31)
+    device: Line = Field(max_length=256)
+    version: Line = Field(max_length=64)
+    tags: Tags = ()
+    """What it is good for beyond its kinds: jobs may require some."""
 
 
 class WorkerWelcome(Contract):
@@ -240,7 +255,7 @@ class WorkerWelcome(Contract):
 
 
 class ClaimRequest(Contract):
-    kinds: tuple[TaskKind, ...] = Field(min_length=1)
+    kinds: tuple[TaskKind, ...] = Field(min_length=1, max_length=32)
     wait_s: float = Field(default=10.0, ge=0, le=30)
     """Long-poll: how long the coordinator may hold the request while there is nothing to do."""
 
@@ -250,7 +265,7 @@ class Claim(Contract):
 
     task_id: str
     job_id: str
-    attempt: int
+    attempt: Number
     payload: Payload
     checkpoint: Sha256 | None = None
     """The last checkpoint that an earlier attempt published."""
@@ -258,9 +273,9 @@ class Claim(Contract):
 
 class Heartbeat(Contract):
     task_id: str
-    attempt: int
+    attempt: Number
     progress: Progress | None = None
-    log: str = Field(default="", max_length=65536)
+    log: Log = ""
     """Lines written since the last beat."""
 
 
@@ -271,17 +286,29 @@ class HeartbeatReply(Contract):
 
 
 class Commit(Contract):
-    attempt: int
+    attempt: Number
     result: Result
 
 
 class Failure(Contract):
-    attempt: int
+    attempt: Number
     problem: Problem
     retryable: bool
-    log: str = Field(default="", max_length=65536)
+    log: Log = ""
 
 
 class Checkpoint(Contract):
-    attempt: int
+    attempt: Number
     sha256: Sha256
+
+
+def read_tags(words: Sequence[str]) -> tuple[str, ...]:
+    """Tags of the command line; InputError where one is none."""
+    try:
+        return TypeAdapter(Tags).validate_python(tuple(dict.fromkeys(words)))
+    except ValidationError as error:
+        raise InputError(
+            f"'{error.errors()[0]['input']}' is refused as a tag",
+            where="--tag",
+            remedy="Use letters, digits and . _ -, at most 63 of them and at most 32 tags.",
+        ) from None

@@ -21,7 +21,7 @@ from kiln_service.api import health as health_routes
 from kiln_service.api import jobs as job_routes
 from kiln_service.api import operators as operator_routes
 from kiln_service.api import workers as worker_routes
-from kiln_service.api.common import PROBLEM_SCHEMA, Parts, caller
+from kiln_service.api.common import PROBLEM_SCHEMA, Parts, caller, problem_answers
 from kiln_service.auth import TokenBook, own_token
 from kiln_service.blobs import Blobs
 from kiln_service.config import ServiceConfig
@@ -29,6 +29,7 @@ from kiln_service.db import Database
 from kiln_service.db.migrate import migrate
 from kiln_service.events import Signals
 from kiln_service.maintenance import Maintenance
+from kiln_service.metrics import RequestSeconds
 from kiln_service.webhooks import Deliverer
 from kiln_service.work import Work
 
@@ -55,6 +56,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         """This interface, as OpenAPI."""
         return JSONResponse(openapi_document(app))
 
+    app.state.request_seconds = RequestSeconds()
     dashboard.install(app)
     problems.install(app, tokens, config.limits, dashboard.error_page)
     return app
@@ -67,11 +69,16 @@ def openapi_document(app: FastAPI) -> dict[str, object]:
     for name in ("HTTPValidationError", "ValidationError"):
         schemas.pop(name, None)
     schemas["Problem"] = PROBLEM_SCHEMA
-    problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     for path in document["paths"].values():
         for operation in path.values():
-            if "422" in operation["responses"]:
-                operation["responses"]["422"] = {"description": "The input is not usable", "content": problem}
+            answers = operation["responses"]
+            codes = {422} if "422" in answers else set()
+            if "requestBody" in operation:
+                codes |= {413, 422}
+            if "security" in operation:
+                codes |= {401, 403, 429, 503}
+            documented = {str(code): answer for code, answer in problem_answers(*codes).items()}
+            operation["responses"] = dict(sorted((answers | documented).items()))
     return document
 
 

@@ -8,19 +8,21 @@ configuration, or were made by an operator (`operators.create_token`) and are lo
 import hashlib
 import hmac
 import os
+import re
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from kiln_schemas.errors import AuthError, Forbidden
+from kiln_schemas.errors import AuthError, Forbidden, InputError
 from kiln_schemas.operators import Scope
 from kiln_service.config import OWN_TOKEN, TokenEntry
 from kiln_service.db import Database
 
 TOKEN_FILE: Final = "token"
+OWNER_VARIABLE: Final = "LIGHTKILN_OWNER_TOKEN"
 MEMORY_S: Final = 2.0
 """A token of the database is remembered for so long: a revoked one is refused after that at the latest."""
 MEMORY_SIZE: Final = 4096
@@ -55,8 +57,13 @@ class TokenBook:
         self._entries = tuple(entries)
         self._remembered: dict[str, tuple[Principal, float]] = {}
 
-    async def authenticate(self, header: str | None, database: Database) -> Principal:
-        """The caller with this Authorization header; AuthError where there is none or the token is unknown."""
+    async def authenticate(
+        self, header: str | None, database: Database, before_lookup: Callable[[], None] = lambda: None
+    ) -> Principal:
+        """The caller with this Authorization header; AuthError where there is none or the token is unknown.
+
+        `before_lookup` may refuse by an exception before the database is asked for a token.
+        """
         if not header:
             raise AuthError(
                 "no token was sent",
@@ -64,7 +71,8 @@ class TokenBook:
                 remedy="Send `Authorization: Bearer TOKEN` (by default it is in the data folder's file `token`).",
             )
         scheme, _, token = header.partition(" ")
-        principal = await self.find(digest_of(token.strip()), database) if scheme.lower() == "bearer" else None
+        bearer = scheme.lower() == "bearer"
+        principal = await self.find(digest_of(token.strip()), database, before_lookup) if bearer else None
         if principal is None:
             raise AuthError(
                 "the token is not known here",
@@ -73,7 +81,9 @@ class TokenBook:
             )
         return principal
 
-    async def find(self, digest: str, database: Database) -> Principal | None:
+    async def find(
+        self, digest: str, database: Database, before_lookup: Callable[[], None] = lambda: None
+    ) -> Principal | None:
         """Whose token has this sha256."""
         found: TokenEntry | None = None
         for entry in self._entries:  # all of them, so that the time tells nothing
@@ -81,15 +91,16 @@ class TokenBook:
                 found = entry
         if found is not None:
             return Principal(found.name, frozenset(found.scopes))
-        return await self._stored(digest, database)
+        return await self._stored(digest, database, before_lookup)
 
-    async def _stored(self, digest: str, database: Database) -> Principal | None:
+    async def _stored(self, digest: str, database: Database, before_lookup: Callable[[], None]) -> Principal | None:
         """Whose token of the database has this hash, as of MEMORY_S ago or later."""
         now = time.monotonic()
         principal, until = self._remembered.get(digest, (None, 0.0))
         if principal is not None and now < until:
             return principal
         self._remembered.pop(digest, None)
+        before_lookup()
         async with database.transaction() as tx:
             row = await tx.maybe("find_token", sha256=digest)
             if row is None:
@@ -109,7 +120,16 @@ def digest_of(secret: str) -> str:
 
 
 def own_token(data: Path) -> TokenEntry:
-    """The token of the data folder, made at the first start (mode 0600), with every scope."""
+    """The owner's token, with every scope: given by OWNER_VARIABLE, else in the data folder, where it is made.
+
+    The file has mode 0600. The variable gives several coordinators the same token.
+    """
+    if given := os.environ.get(OWNER_VARIABLE, ""):
+        if not re.fullmatch(r"[\x21-\x7e]{16,}", given):
+            raise InputError(
+                "the token is refused", where=OWNER_VARIABLE, remedy="Set 16 characters or more, printable, no blanks."
+            )
+        return _owner(given)
     path = data / TOKEN_FILE
     if not path.exists():
         draft = path.with_name(f".{TOKEN_FILE}.{os.getpid()}")
@@ -125,4 +145,8 @@ def own_token(data: Path) -> TokenEntry:
             pass
         finally:
             draft.unlink()
-    return TokenEntry(name=OWN_TOKEN, sha256=digest_of(path.read_text().strip()), scopes=(Scope.ADMIN,))
+    return _owner(path.read_text().strip())
+
+
+def _owner(token: str) -> TokenEntry:
+    return TokenEntry(name=OWN_TOKEN, sha256=digest_of(token), scopes=(Scope.ADMIN,))

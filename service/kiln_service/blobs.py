@@ -13,8 +13,9 @@ import os
 import shutil
 import tempfile
 from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from datetime import timedelta
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, TYPE_CHECKING, Final
 from urllib.parse import unquote, urlparse
 
 import obstore
@@ -22,9 +23,14 @@ import psycopg
 from obstore.exceptions import BaseError
 from obstore.store import ObjectStore, from_url
 
-from kiln_schemas.errors import DISK_FULL, InputError, MachineLacks, NotFound, TooLarge, Truncated
+from kiln_schemas.errors import DISK_FULL, InputError, MachineLacks, NotFound, TooLarge, Truncated, Unreachable
 from kiln_service.config import Limits
 from kiln_service.db import Database, Tx
+from kiln_service.ids import new_id
+
+if TYPE_CHECKING:
+    from obstore import GetResult
+    from obstore.store import ClientConfig, RetryConfig, S3Config
 
 WRITE_BYTES: Final = 2**20
 """Uploads go to the disk in pieces of at least this size."""
@@ -33,13 +39,18 @@ READ_GAP: Final = 2**16
 """Parts of a blob that lie closer are read at once."""
 
 
+RETRIES: Final["RetryConfig"] = {"max_retries": 4, "retry_timeout": timedelta(seconds=20)}
+"""A bucket that does not answer is asked again for so long, then the client is told, who asks again as well."""
+
+
 def open_objects(url: str) -> ObjectStore:
     """The objects under a `file://` or `s3://` URL; an S3 server in `AWS_ENDPOINT_URL` may speak plain HTTP."""
+    if not url.startswith("s3://"):
+        return from_url(url)
     endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
-    if url.startswith("s3://") and endpoint:
-        plain = endpoint.startswith("http://")
-        return from_url(url, config={"endpoint": endpoint}, client_options={"allow_http": plain})
-    return from_url(url)
+    options: ClientConfig = {"allow_http": endpoint.startswith("http://"), "connect_timeout": timedelta(seconds=5)}
+    config: S3Config = {"endpoint": endpoint} if endpoint else {}
+    return from_url(url, config=config, client_options=options, retry_config=RETRIES)
 
 
 class Blobs:
@@ -91,18 +102,24 @@ class Blobs:
         return int(row["size"])
 
     async def read(self, sha256: str, start: int, end: int) -> AsyncIterator[bytes]:
-        """Bytes start..end-1 of a blob in pieces."""
+        """Bytes start..end-1 of a blob in pieces; Unreachable or NotFound where they are not to be had."""
         if start == end:
-            return
-        result = await obstore.get_async(self._objects, _key(sha256), options={"range": (start, end)})
-        async for piece in result.stream(min_chunk_size=READ_BYTES):
-            yield bytes(piece)
+            return _nothing()
+        try:
+            with _storage_errors():
+                result = await obstore.get_async(self._objects, _key(sha256), options={"range": (start, end)})
+        except FileNotFoundError:
+            raise NotFound(
+                f"the storage has lost blob {sha256}", where="storage", remedy="Restore the blobs from a backup."
+            ) from None
+        return _pieces(result)
 
     async def read_parts(self, sha256: str, starts: Sequence[int], length: int) -> list[bytes]:
         """So many bytes of a blob from each of these places on."""
-        parts = await obstore.get_ranges_async(
-            self._objects, _key(sha256), starts=starts, lengths=[length] * len(starts), coalesce=READ_GAP
-        )
+        with _storage_errors():
+            parts = await obstore.get_ranges_async(
+                self._objects, _key(sha256), starts=starts, lengths=[length] * len(starts), coalesce=READ_GAP
+            )
         return [bytes(part) for part in parts]
 
     async def take(self, body: AsyncIterator[bytes]) -> str:
@@ -133,14 +150,11 @@ class Blobs:
         return deleted
 
     async def check(self) -> None:
-        """Write and delete a small object; MachineLacks where the storage does not take it."""
-        key = f"probe-{os.getpid()}"
-        try:
-            with _no_space_is_507(self._incoming):
-                await obstore.put_async(self._objects, key, b"lightkiln")
-                await obstore.delete_async(self._objects, key)
-        except BaseError as error:
-            raise MachineLacks(f"the blob storage does not take a write: {error}", where="storage") from None
+        """Write and delete a small object; Unreachable where the storage does not take it."""
+        key = f"probe-{new_id()}"
+        with _no_space_is_507(self._incoming), _storage_errors():
+            await obstore.put_async(self._objects, key, b"lightkiln")
+            await obstore.delete_async(self._objects, key)
 
     def sweep_incoming(self) -> None:
         """Delete uploads that a killed coordinator left; only while no other coordinator uses the folder."""
@@ -184,6 +198,8 @@ class Blobs:
         return digest.hexdigest(), size
 
     async def _publish(self, sha256: str, size: int, file: Path) -> None:
+        if self._folder is None:
+            await self._put(sha256, file)  # before the transaction: a slow bucket must not use up the connections
         async with self._database.transaction() as tx:
             await tx.run("lock_blob", sha256=sha256)
             if not await tx.all("touch_blobs", hashes=[sha256]):
@@ -191,13 +207,19 @@ class Blobs:
                 await tx.run("insert_blob", sha256=sha256, size=size)
 
     async def _place(self, sha256: str, file: Path) -> None:
+        """Make the object durable; the blob is locked."""
         if self._folder is not None:
             await asyncio.to_thread(_move_durably, file, self._folder / _key(sha256))
             return
         try:
+            with _storage_errors():
+                await obstore.head_async(self._objects, _key(sha256))
+        except FileNotFoundError:  # collected after it was put and before it was locked
+            await self._put(sha256, file)
+
+    async def _put(self, sha256: str, file: Path) -> None:
+        with _storage_errors():
             await obstore.put_async(self._objects, _key(sha256), file)
-        except BaseError as error:
-            raise MachineLacks(f"the blob storage does not take {sha256}: {error}", where="storage") from None
 
     @contextlib.contextmanager
     def _temporary(self) -> Iterator[IO[bytes]]:
@@ -224,6 +246,36 @@ async def use_blobs(tx: Tx, owner: str, hashes: Iterable[str]) -> None:
 async def drop_blobs(tx: Tx, owner: str) -> None:
     """`owner` no longer uses any blob."""
     await tx.run("drop_blob_uses", owner=owner)
+
+
+async def _nothing() -> AsyncIterator[bytes]:
+    return
+    yield b""
+
+
+async def _pieces(result: "GetResult") -> AsyncIterator[bytes]:
+    async for piece in result.stream(min_chunk_size=READ_BYTES):
+        yield bytes(piece)
+
+
+@contextlib.contextmanager
+def _storage_errors() -> Iterator[None]:
+    """A storage that does not answer or refuses is Unreachable: whoever asked tries again."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise
+    except BaseError as error:
+        raise Unreachable(
+            f"the blob storage does not answer: {_first_line(error)}",
+            where="storage",
+            remedy="Check the storage's address, credentials and bucket.",
+        ) from None
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
 
 
 def _key(sha256: str) -> str:

@@ -26,6 +26,26 @@ class TokenEntry(Contract):
     scopes: tuple[Scope, ...] = Field(min_length=1)
 
 
+class Rate(Contract):
+    """A token bucket (`kiln_service.rates`)."""
+
+    per_s: float = Field(gt=0)
+    """Requests a second in the long run."""
+    burst: int = Field(ge=1)
+    """Requests at once."""
+
+
+class Rates(Contract):
+    """How often one caller may ask."""
+
+    clients: Rate = Rate(per_s=200, burst=2000)
+    """A token, on all routes but those of workers."""
+    workers: Rate = Rate(per_s=5000, burst=20000)
+    """A token on the routes of workers, tasks and blobs: a whole farm may share it."""
+    failures: Rate = Rate(per_s=5, burst=1000)
+    """An address that fails to sign in."""
+
+
 class Limits(Contract):
     """Bounds that keep one client from exhausting the coordinator."""
 
@@ -39,6 +59,8 @@ class Limits(Contract):
     """Most jobs on a page."""
     tiles: int = Field(default=65536, gt=0)
     """Most render tiles of a job, and most blocks to refine."""
+    rates: Rates = Rates()
+    """How often one caller may ask."""
 
 
 class Timing(Contract):
@@ -53,9 +75,20 @@ class Timing(Contract):
     database_s: float = Field(default=15.0, gt=0)
     """A request waits so long for a database connection before it is answered 503."""
     maintenance_s: float = Field(default=5.0, gt=0)
-    """Between two passes of the reaper and the reconciler."""
+    """Between two passes of the reaper."""
+    block_s: float = Field(default=3600.0, gt=0)
+    """A worker that fails tasks of a kind of a job gets no more of them for so long (`blocks`)."""
     blob_grace_s: float = Field(default=3600.0, gt=0)
     """A blob that nothing uses is kept this long after it was last uploaded or asked for."""
+
+
+class FailedTasks(Contract):
+    """A task that fails leaves the others to go on; a job of which so many failed fails at once."""
+
+    least: int = Field(default=10, ge=1)
+    """At least so many tasks of a kind,"""
+    of_all: float = Field(default=0.1, ge=0, le=1)
+    """and more than this share of all tasks of the kind."""
 
 
 class ServiceConfig(Contract):
@@ -67,20 +100,23 @@ class ServiceConfig(Contract):
     port: int = Field(default=8321, ge=0, le=65535)
     database: str | None = None
     """libpq connection string."""
+    storage_url: str | None = None
+    """Where light-field stores and blobs go, `file://` or `s3://`, reachable from every worker; `data` by default."""
     store_url: str | None = None
-    """Where light-field stores go, `file://` or `s3://`, reachable from every worker; `<data>/store` by default."""
+    """Where light-field stores go instead; `<storage>/store` by default."""
     blob_url: str | None = None
-    """Where blobs go, `file://` or `s3://`; `<data>/blobs` by default."""
+    """Where blobs (uploads, what tasks make, artifacts) go instead; `<storage>/blobs` by default."""
     tokens: tuple[TokenEntry, ...] = ()
     """Tokens besides the one in `<data>/token`."""
     max_attempts: int = Field(default=4, ge=1)
     """A task fails for good after this many attempts in a row that ended without a new checkpoint."""
+    failed_tasks: FailedTasks = FailedTasks()
     pool_size: int = Field(default=10, ge=2)
     """Database connections."""
     limits: Limits = Limits()
     timing: Timing = Timing()
 
-    @field_validator("store_url", "blob_url")
+    @field_validator("storage_url", "store_url", "blob_url")
     @classmethod
     def _is_file_or_bucket(cls, url: str | None) -> str | None:
         if url is not None and not url.startswith(("file:///", "s3://")):
@@ -90,12 +126,16 @@ class ServiceConfig(Contract):
     @property
     def store_base(self) -> str:
         """The folder URL under which every job has its light-field store."""
-        return (self.store_url or (self.data.absolute() / "store").as_uri()).rstrip("/")
+        return (self.store_url or f"{self._storage}/store").rstrip("/")
 
     @property
     def blob_base(self) -> str:
         """The folder URL of the blobs."""
-        return (self.blob_url or (self.data.absolute() / "blobs").as_uri()).rstrip("/")
+        return (self.blob_url or f"{self._storage}/blobs").rstrip("/")
+
+    @property
+    def _storage(self) -> str:
+        return (self.storage_url or self.data.absolute().as_uri()).rstrip("/")
 
     @property
     def incoming(self) -> Path:

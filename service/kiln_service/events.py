@@ -35,6 +35,7 @@ async def add_event(
     tx: Tx, job_id: str, kind: str, actor: str, *, task_id: str | None = None, detail: dict[str, Any] | None = None
 ) -> None:
     """Append to a job's history; the job is locked."""
+    log.info(kind, extra={"job_id": job_id, "actor": actor} | ({"task_id": task_id} if task_id else {}))
     await tx.run("add_event", job_id=job_id, task_id=task_id, kind=kind, actor=actor, detail=Jsonb(detail or {}))
 
 

@@ -1,15 +1,16 @@
-"""What clients ask of a job: submit, rank and label, pause and resume, cancel, retry, archive it."""
+"""What clients ask of a job: submit, rank and label, pause and resume, cancel, retry, do parts again, archive it."""
 
 import hashlib
-from collections.abc import Sequence, Set
+from collections.abc import Set
 
+from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
 from kiln_schemas.errors import Conflict, InputError, NotFound
 from kiln_schemas.gates import check_gates
-from kiln_schemas.job import JobChange, JobRequest, check_bundle
+from kiln_schemas.job import JobChange, JobRequest, RequeueRequest, check_bundle
 from kiln_schemas.settings import BakeSettings, make_settings
-from kiln_schemas.states import FINAL_JOB_STATES, JobState
+from kiln_schemas.states import FINAL_JOB_STATES, LIVE_JOB_STATES, PUBLISHED_JOB_STATES, JobState, TaskState
 from kiln_schemas.tasks import TaskKind
 from kiln_service import queue, transitions
 from kiln_service.auth import Principal
@@ -67,6 +68,7 @@ async def submit(
             actor=who.actor,
             priority=request.priority,
             labels=request.labels,
+            tags=request.tags,
             submission=submission,
         )
         await use_blobs(tx, f"job:{job.id}", bundle.files.values())
@@ -91,15 +93,17 @@ async def _submitted(tx: Tx, submission: transitions.Submission) -> JobRow | Non
 
 
 async def change(database: Database, job_id: str, wanted: JobChange, actor: str) -> None:
-    """Rank or label a job anew; its waiting tasks change their place in the queue."""
+    """Rank or label a job anew, or have it done by other workers; its tasks change their place in the queue."""
     async with database.transaction() as tx:
         await lock_job(tx, job_id)
         labels = None if wanted.labels is None else Jsonb(dict(wanted.labels))
-        await tx.run("change_job", id=job_id, priority=wanted.priority, labels=labels)
+        tags = None if wanted.tags is None else list(wanted.tags)
+        await tx.run("change_job", id=job_id, priority=wanted.priority, labels=labels, tags=tags)
+        if wanted.priority is not None:
+            await tx.run("rank_tasks", job_id=job_id, priority=wanted.priority, step=queue.RANK_STEP)
+        if wanted.tags is not None:
+            await queue.announce(tx, list(TaskKind))
         await add_event(tx, job_id, "job.changed", actor, detail=wanted.model_dump(mode="json", exclude_none=True))
-    if wanted.priority is not None:
-        async with database.transaction() as tx:  # a claim locks the queue before the job (see `Tx` on locks)
-            await tx.run("rank_queue_jobs", job_id=job_id, priority=wanted.priority, step=queue.PRIORITY_STEP)
 
 
 async def pause(database: Database, job_id: str, actor: str) -> None:
@@ -109,8 +113,7 @@ async def pause(database: Database, job_id: str, actor: str) -> None:
         if job.state is JobState.PAUSED:
             return
         _require(job, {JobState.QUEUED, JobState.ACTIVE}, "paused")
-        idle = await transitions.pause_job(tx, job, actor)
-    await withdraw(database, idle)
+        await transitions.move_job(tx, job, JobState.PAUSED, actor)
 
 
 async def resume(database: Database, job_id: str, actor: str) -> None:
@@ -124,10 +127,10 @@ async def resume(database: Database, job_id: str, actor: str) -> None:
 
 
 async def retry(database: Database, job_id: str, actor: str) -> None:
-    """Do a failed or canceled job's unfinished tasks again; what has completed stays."""
+    """Do a failed or canceled job's unfinished tasks again, or the failed ones of a job that goes on without them."""
     async with database.transaction() as tx:
         job = await lock_job(tx, job_id)
-        _require(job, {JobState.FAILED, JobState.CANCELED}, "retried")
+        _require(job, {*LIVE_JOB_STATES, JobState.FAILED, JobState.CANCELED}, "retried")
         kinds = {TaskKind(row["kind"]) for row in await tx.all("unfinished_kinds", job_id=job.id)}
         stage = next((stage for stage in METHODS[job.method].stages if stage in kinds), None)
         if stage is None:
@@ -136,7 +139,51 @@ async def retry(database: Database, job_id: str, actor: str) -> None:
                 where="job",
                 remedy="Mend the input and submit it again.",
             )
-        await transitions.reopen_job(tx, job, stage, actor)
+        if job.state in LIVE_JOB_STATES:
+            if not await transitions.reopen_tasks(tx, job, stage, [TaskState.FAILED], actor):
+                raise Conflict(f"job {job_id} is {job.state}, and none of its tasks has failed", where="job")
+            return
+        job = await transitions.move_job(tx, job, JobState.QUEUED, actor)
+        await transitions.reopen_tasks(tx, job, stage, [TaskState.FAILED, TaskState.CANCELED], actor)
+
+
+async def requeue(database: Database, job_id: str, wanted: RequeueRequest, actor: str) -> None:
+    """Do tasks again that are done, and all that follows from them; what a completed job had published is gone."""
+    async with database.transaction() as tx:
+        job = await lock_job(tx, job_id)
+        _require(job, LIVE_JOB_STATES | PUBLISHED_JOB_STATES, "requeued")
+        stages = METHODS[job.method].stages
+        later = stages[stages.index(wanted.kind) + 1 :]
+        rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[wanted.kind.value])
+        chosen = [row["id"] for row in rows if _is_wanted(row, wanted)]
+        if not chosen:
+            raise InputError(
+                f"job {job_id} has {len(rows)} {wanted.kind} tasks, none of them in what was asked for",
+                where="requeue",
+                remedy="GET .../tasks lists them with their labels.",
+            )
+        if not (redone := await transitions.redo_tasks(tx, job, chosen, TaskState.QUEUED)):
+            raise Conflict(f"the {wanted.kind} tasks of job {job_id} are not done yet", where="job")
+        rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[kind.value for kind in later])
+        waiting = await transitions.redo_tasks(tx, job, [row["id"] for row in rows], TaskState.WAITING)
+        await tx.run("delete_artifacts", job_id=job.id)
+        detail = wanted.model_dump(mode="json", exclude_none=True) | {"count": redone, "waiting": waiting}
+        await add_event(tx, job.id, "tasks.requeued", actor, detail=detail)
+        if job.state in PUBLISHED_JOB_STATES:
+            await tx.run("set_gate_results", id=job.id, results=Jsonb([]))
+            await transitions.move_job(tx, job, JobState.QUEUED, actor)
+        await queue.announce(tx, [wanted.kind])
+
+
+def _is_wanted(row: DictRow, wanted: RequeueRequest) -> bool:
+    """Whether a task is among those asked for, by its label and by the texels of its tile or block."""
+    if wanted.labels is not None and row["label"] not in wanted.labels:
+        return False
+    square = row["spec"].get("tile") or row["spec"].get("block")
+    if square is None:
+        return wanted.rows is None and wanted.columns is None
+    spans = ((wanted.rows, square["row"]), (wanted.columns, square["column"]))
+    return all(span is None or (span[0] < start + square["size"] and start < span[1]) for span, start in spans)
 
 
 async def archive(database: Database, job_id: str, actor: str) -> None:
@@ -164,22 +211,14 @@ async def cancel(database: Database, job_id: str, actor: str) -> None:
         if job.state in FINAL_JOB_STATES:
             raise Conflict(f"job {job_id} is {job.state} already", where="job")
         job = await transitions.move_job(tx, job, JobState.CANCEL_REQUESTED, actor)
-        idle = await transitions.cancel_idle_tasks(tx, job, actor)
+        await transitions.cancel_idle_tasks(tx, job, actor)
         await settle_cancel(tx, job)
-    await withdraw(database, idle)
 
 
 async def settle_cancel(tx: Tx, job: JobRow) -> None:
     """cancel-requested > canceled, once no worker has a task of the job."""
     if job.state is JobState.CANCEL_REQUESTED and (await tx.one("count_active", job_id=job.id))["tasks"] == 0:
         await transitions.move_job(tx, job, JobState.CANCELED, transitions.COORDINATOR)
-
-
-async def withdraw(database: Database, queue_jobs: Sequence[int]) -> None:
-    """Take canceled tasks out of the queue, after the transaction that canceled them (see `Tx` on locks)."""
-    if queue_jobs:
-        async with database.transaction() as tx:
-            await queue.withdraw(tx, queue_jobs)
 
 
 async def lock_job(tx: Tx, job_id: str) -> JobRow:

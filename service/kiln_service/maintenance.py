@@ -1,4 +1,4 @@
-"""The coordinator's background work: reaper, reconciler, collection of blobs.
+"""The coordinator's background work: reaper, collection of blobs.
 
 Of all coordinators on a database one does it, the holder of a session's advisory lock; if it dies, another takes over.
 A new holder first waits out one stale period: while no coordinator ran, no heartbeat could arrive.
@@ -17,7 +17,6 @@ from kiln_service.blobs import Blobs
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, Tx
 from kiln_service.reaper import reap
-from kiln_service.reconciler import reconcile
 from kiln_service.work import Work
 
 log = logging.getLogger(__name__)
@@ -58,7 +57,6 @@ class Maintenance:
         try:
             if may_reap:
                 await reap(self._database, self._work, self._timing.stale_s)
-            await reconcile(self._database)
             if time.monotonic() >= self._next_collection:
                 self._next_collection = time.monotonic() + self._timing.blob_grace_s / 4
                 await self._blobs.collect(self._timing.blob_grace_s)

@@ -1,10 +1,13 @@
-"""Metrics for Prometheus, read from the database at each scrape: so any coordinator of several tells the same."""
+"""Metrics for Prometheus, read from the database at each scrape: so any coordinator of several tells the same.
+
+The seconds of requests alone are a coordinator's own, counted since its start.
+"""
 
 from collections.abc import Iterator
 from typing import Final
 
-from prometheus_client import CollectorRegistry
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client import CollectorRegistry, Histogram
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 from prometheus_client.registry import Collector
 from psycopg.rows import DictRow
@@ -19,6 +22,10 @@ MEDIA_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 ENDS: Final = {"task.retried": "failed", "task.lost": "lost", "task.failed": "gave-up"}
 """Events of attempts that ended without a result, and what they are called."""
 
+TASK_SECONDS: Final = (1.0, 5.0, 15.0, 60.0, 300.0, 900.0, 3600.0, 14400.0)
+REQUEST_SECONDS: Final = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0, 30.0)
+"""Bounds of the histograms' buckets."""
+
 Rows = list[DictRow]
 
 
@@ -26,12 +33,17 @@ async def text(database: Database) -> bytes:
     """All metrics in the text format."""
     async with database.transaction() as tx:
         tasks, jobs = await tx.all("count_tasks"), await tx.all("count_jobs")
-        done, ended = await tx.all("sum_seconds"), await tx.all("count_events", kinds=list(ENDS))
-        blobs = await tx.one("sum_blobs")
+        done, ended = await tx.all("sum_work"), await tx.all("count_events", kinds=list(ENDS))
+        seconds = await tx.all("seconds_of_tasks", bounds=[bound + 1e-9 for bound in TASK_SECONDS])
+        blobs, light = await tx.one("sum_blobs"), await tx.one("sum_light_fields")
     workers = await operators.list_workers(database)
     states = {state: sum(worker.state is state for worker in workers) for state in WorkerState}
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Once([*_queue(tasks, jobs), *_work(done, ended), *_workers(states), *_storage(blobs)]))
+    registry.register(
+        _Once(
+            [*_queue(tasks, jobs), *_work(done, ended), _durations(seconds), *_workers(states), *_storage(blobs, light)]
+        )
+    )
     return generate_latest(registry)
 
 
@@ -63,15 +75,11 @@ def _queue(tasks: Rows, jobs: Rows) -> Iterator[Metric]:
 
 def _work(done: Rows, ended: Rows) -> Iterator[Metric]:
     by_kind = {row["kind"]: row for row in done}
-    for name, column, help_text in (
-        ("lightkiln_tasks_completed", "tasks", "Tasks that workers completed."),
-        ("lightkiln_task_seconds", "seconds", "Busy seconds of completed tasks."),
-    ):
-        family = CounterMetricFamily(name, help_text, labels=["kind"])
-        for kind in TaskKind:
-            row = by_kind.get(kind.value)
-            family.add_metric([kind.value], row[column] if row else 0)
-        yield family
+    family = CounterMetricFamily("lightkiln_tasks_completed", "Tasks that workers completed.", labels=["kind"])
+    for kind in TaskKind:
+        row = by_kind.get(kind.value)
+        family.add_metric([kind.value], row["tasks"] if row else 0)
+    yield family
     rendered = by_kind.get(TaskKind.RENDER.value)
     yield CounterMetricFamily(
         "lightkiln_rendered_texels", "Texels of completed tiles.", value=rendered["texels"] if rendered else 0
@@ -86,6 +94,41 @@ def _work(done: Rows, ended: Rows) -> Iterator[Metric]:
     yield family
 
 
+def _durations(seconds: Rows) -> Metric:
+    """Busy seconds of completed tasks, as a histogram."""
+    family = HistogramMetricFamily("lightkiln_task_seconds", "Busy seconds of completed tasks.", labels=["kind"])
+    for kind in TaskKind:
+        rows = [row for row in seconds if row["kind"] == kind.value]
+        buckets, count = list[tuple[str, float]](), 0
+        for number, bound in enumerate((*TASK_SECONDS, None)):
+            count += sum(row["tasks"] for row in rows if row["bucket"] == number)
+            buckets.append(("+Inf" if bound is None else str(bound), count))
+        family.add_metric([kind.value], buckets, sum(row["seconds"] for row in rows))
+    return family
+
+
+class RequestSeconds:
+    """How long this coordinator's answers took, by route."""
+
+    def __init__(self) -> None:
+        self._registry = CollectorRegistry(auto_describe=False)
+        self._seconds = Histogram(
+            "lightkiln_request_seconds",
+            "Seconds to answer requests, held claims and streams included.",
+            ["method", "route", "status"],
+            registry=self._registry,
+            buckets=REQUEST_SECONDS,
+        )
+
+    def observe(self, method: str, route: str, status: int, seconds: float) -> None:
+        """Count one request."""
+        self._seconds.labels(method, route, f"{status // 100}xx").observe(seconds)
+
+    def text(self) -> bytes:
+        """In the text format."""
+        return generate_latest(self._registry)
+
+
 def _workers(states: dict[WorkerState, int]) -> Iterator[Metric]:
     family = GaugeMetricFamily("lightkiln_workers", "Workers seen within a week, by state.", labels=["state"])
     for state, count in states.items():
@@ -93,6 +136,8 @@ def _workers(states: dict[WorkerState, int]) -> Iterator[Metric]:
     yield family
 
 
-def _storage(blobs: DictRow) -> Iterator[Metric]:
+def _storage(blobs: DictRow, light: DictRow) -> Iterator[Metric]:
+    help_text = "Bytes of radiance in light-field stores; their compressed visibility is not counted."
+    yield GaugeMetricFamily("lightkiln_store_bytes", help_text, light["bytes"])
     yield GaugeMetricFamily("lightkiln_blob_bytes", "Bytes of blobs; light-field stores not counted.", blobs["bytes"])
     yield GaugeMetricFamily("lightkiln_blobs", "Blobs.", blobs["blobs"])

@@ -2,7 +2,7 @@
 
 import hashlib
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final
 
 from psycopg.rows import DictRow
@@ -10,10 +10,12 @@ from psycopg.types.json import Jsonb
 
 from kiln_schemas.errors import Conflict, NotFound
 from kiln_schemas.operators import (
+    DAYS,
     AuditEntry,
     NewToken,
     Order,
     Scope,
+    SleepSchedule,
     TokenRequest,
     TokenView,
     WorkerState,
@@ -21,8 +23,11 @@ from kiln_schemas.operators import (
 )
 from kiln_service.config import OWN_TOKEN, ServiceConfig
 from kiln_service.db import Database, Tx, picked
+from kiln_service.schedules import read_schedule, sleeps_at
 
 OFFLINE_S: Final = 60.0
+ERROR_AFTER: Final = 3
+"""Attempts in a row that ended badly, after which a worker is listed as in error."""
 FORGOTTEN_S: Final = 7 * 86400.0
 """Workers not seen for so long are left out of lists."""
 
@@ -88,6 +93,31 @@ async def order_worker(database: Database, worker_id: str, order: Order, actor: 
         await record(tx, actor, f"worker.{order.value}", row["name"], {"worker": worker_id})
 
 
+async def unblock_worker(database: Database, worker_id: str, actor: str) -> None:
+    """Let workers of this one's name take tasks of all jobs again; NotFound where there is none."""
+    async with database.transaction() as tx:
+        row = await tx.maybe("find_worker", id=worker_id)
+        if row is None:
+            raise NotFound(f"no worker '{worker_id}'", where="worker", remedy="GET /v1/workers lists them.")
+        await tx.run("delete_blocks", worker=row["name"])
+        await record(tx, actor, "worker.unblocked", row["name"], {"worker": worker_id})
+
+
+async def set_schedule(database: Database, worker: str, schedule: SleepSchedule, actor: str) -> None:
+    """From now on the workers of this name sleep by this schedule."""
+    days = [DAYS.index(day) for day in schedule.days]
+    async with database.transaction() as tx:
+        await tx.run("put_schedule", worker=worker, **schedule.model_dump() | {"days": days})
+        await record(tx, actor, "worker.schedule", worker, schedule.model_dump(mode="json"))
+
+
+async def drop_schedule(database: Database, worker: str, actor: str) -> None:
+    """They sleep when they are told to and at no other time. Asking twice is no error."""
+    async with database.transaction() as tx:
+        if await tx.run("delete_schedule", worker=worker):
+            await record(tx, actor, "worker.schedule", worker)
+
+
 async def list_audit(database: Database, before: int | None, limit: int) -> tuple[AuditEntry, ...]:
     """The record, newest first."""
     async with database.transaction() as tx:
@@ -100,12 +130,17 @@ async def record(tx: Tx, actor: str, action: str, target: str, detail: Mapping[s
 
 
 def _worker_view(row: DictRow) -> WorkerView:
-    names: Sequence[str] = [name for name in WorkerView.model_fields if name not in ("state", "task")]
     task = None if row["task_id"] is None else f"{row['kind']} {row['label']}"
-    return WorkerView.model_validate({name: row[name] for name in names} | {"state": _state(row), "task": task})
+    schedule = None if row["days"] is None else read_schedule(row)
+    made = {"state": _state(row, schedule), "task": task, "schedule": schedule}
+    return WorkerView.model_validate({name: row[name] for name in WorkerView.model_fields if name not in made} | made)
 
 
-def _state(row: DictRow) -> WorkerState:
+def _state(row: DictRow, schedule: SleepSchedule | None) -> WorkerState:
     if row["offline"]:
         return WorkerState.OFFLINE
-    return {"sleep": WorkerState.ASLEEP, "drain": WorkerState.DRAINING}.get(row["orders"], WorkerState.AWAKE)
+    if row["orders"] == "drain":
+        return WorkerState.DRAINING
+    if row["orders"] == "sleep" or (schedule is not None and sleeps_at(schedule, row["now"])):
+        return WorkerState.ASLEEP
+    return WorkerState.ERROR if row["strikes"] >= ERROR_AFTER else WorkerState.AWAKE

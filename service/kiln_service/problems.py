@@ -27,12 +27,15 @@ from kiln_schemas.errors import (
     NotFound,
     Problem,
     TooLarge,
+    TooMany,
     Unreachable,
 )
 from kiln_service import sessions
 from kiln_service.auth import Principal, TokenBook
 from kiln_service.config import Limits
 from kiln_service.ids import new_id
+from kiln_service.rates import RateLimits
+from kiln_service.requests import Requests
 
 log = logging.getLogger(__name__)
 
@@ -85,18 +88,21 @@ def answer(request: Request, problem: Problem) -> Response:
 def install(
     app: FastAPI, tokens: TokenBook, limits: Limits, error_page: Callable[[Request, Problem], Response]
 ) -> None:
-    """Handlers for every kind of error, then (outermost last) authentication, body bounds and the last resort."""
+    """Handlers for each kind of error, then (outermost last) body bounds, authentication, last resort, headers, log."""
     app.state.error_page = error_page
+    app.state.rates = RateLimits(limits.rates)
     app.add_exception_handler(KilnError, _kiln_error)
     app.add_exception_handler(RequestValidationError, _invalid_request)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(psycopg.OperationalError, _database_away)
     app.add_exception_handler(PoolTimeout, _database_away)
+    app.add_exception_handler(psycopg.DataError, _not_storable)
     app.add_exception_handler(ClientDisconnect, _gone)
     app.add_middleware(BoundedBody, limit=limits.body_bytes)
-    app.add_middleware(Authentication, tokens=tokens)
+    app.add_middleware(Authentication, tokens=tokens, rates=app.state.rates)
     app.add_middleware(LastResort)
     app.add_middleware(SecurityHeaders)
+    app.add_middleware(Requests)
 
 
 async def _kiln_error(request: Request, error: Exception) -> Response:
@@ -117,10 +123,13 @@ async def _invalid_request(request: Request, error: Exception) -> Response:
 
 
 async def _http_error(request: Request, error: Exception) -> Response:
-    """404 and 405 of the router."""
+    """404 and 405 of the router, and bodies that FastAPI could not read."""
     assert isinstance(error, HTTPException)
     if isinstance(error.__cause__, KilnError):  # raised while FastAPI read the body
         return answer(request, error.__cause__.problem())
+    if isinstance(error.__cause__, UnicodeDecodeError | RecursionError | ValueError):
+        why = _UNREADABLE.get(type(error.__cause__), "holds a number that is too long")
+        return answer(request, InputError(f"the JSON {why}", where="body", remedy="Mend the request.").problem())
     about: dict[str, Any] = {"where": f"{request.method} {request.url.path}"}
     match error.status_code:
         case 404:
@@ -138,6 +147,23 @@ async def _database_away(request: Request, error: Exception) -> Response:
     log.error("the database does not answer: %s", error)
     away = Unreachable("the database does not answer", where="database", remedy="Try again in a few seconds.")
     return answer(request, away.problem())
+
+
+_UNREADABLE: Final = {UnicodeDecodeError: "is not UTF-8", RecursionError: "nests too deeply"}
+_NOT_STORABLE: Final = {
+    psycopg.DataError: "a text holds the character U+0000",
+    psycopg.errors.UntranslatableCharacter: "a text holds the character U+0000",
+    psycopg.errors.NumericValueOutOfRange: "a number is too large",
+}
+
+
+async def _not_storable(request: Request, error: Exception) -> Response:
+    """What the contracts let pass and the database does not hold; any other error in data is a defect of ours."""
+    what = next((what for kind, what in _NOT_STORABLE.items() if type(error) is kind), None)
+    if what is None:
+        raise error
+    place = f"{request.method} {request.url.path}"
+    return answer(request, InputError(what, where=place, remedy="Leave it out.").problem())
 
 
 async def _gone(_: Request, error: Exception) -> Response:
@@ -199,37 +225,53 @@ class Authentication:
     `scope["session"]` is the cookie's value where the caller is known by it.
     """
 
-    def __init__(self, app: ASGIApp, tokens: TokenBook) -> None:
-        self._app, self._tokens = app, tokens
+    def __init__(self, app: ASGIApp, tokens: TokenBook, rates: RateLimits) -> None:
+        self._app, self._tokens, self._rates = app, tokens, rates
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http" and not is_open(scope["path"]):
             request = Request(scope)
             try:
-                scope["principal"] = await self._who(request)
+                scope["principal"] = await self._caller(request)
+                self._rates.count(scope["principal"].name, scope["path"])
             except AuthError as error:
-                response = _sign_in_first(request) or problem_response(error.problem())
-                await response(scope, receive, send)
+                await (_sign_in_first(request) or problem_response(error.problem()))(scope, receive, send)
                 return
             except KilnError as error:
-                await answer(request, error.problem())(scope, receive, send)
+                response = answer(request, error.problem())
+                if isinstance(error, TooMany):
+                    response.headers["Retry-After"] = str(error.wait_s)
+                await response(scope, receive, send)
                 return
             except (psycopg.OperationalError, PoolTimeout) as error:
                 await (await _database_away(request, error))(scope, receive, send)
                 return
         await self._app(scope, receive, send)
 
-    async def _who(self, request: Request) -> Principal:
-        """The caller by bearer token or, on pages and where nothing is changed, by the cookie of a session."""
-        database, header = request.app.state.parts.database, request.headers.get("authorization")
-        cookie = sessions.read_cookie(request.headers)
+    async def _caller(self, request: Request) -> Principal:
+        """Who calls, by bearer token or, on pages and where nothing is changed, by the cookie of a session.
+
+        An address that failed too often is refused before a token is looked up in the database.
+        """
+        header, cookie = request.headers.get("authorization"), sessions.read_cookie(request.headers)
+        address = client_address(request)
+        database = request.app.state.parts.database
         safe = request.method in sessions.SAFE_METHODS
-        if header is not None or cookie is None or not (safe or is_page(request.url.path)):
-            return await self._tokens.authenticate(header, database)
-        if not safe:
-            sessions.check_origin(request.headers)
-        request.scope["session"] = cookie
-        return await sessions.principal_of(database, self._tokens, cookie)
+        try:
+            if header is not None or cookie is None or not (safe or is_page(request.url.path)):
+                return await self._tokens.authenticate(header, database, lambda: self._rates.may_sign_in(address))
+            if not safe:
+                sessions.check_origin(request.headers)
+            request.scope["session"] = cookie
+            return await sessions.principal_of(database, self._tokens, cookie)
+        except AuthError:
+            self._rates.failed(address)
+            raise
+
+
+def client_address(request: Request) -> str:
+    """Whose failures to sign in are counted together."""
+    return request.client.host if request.client else ""
 
 
 def _sign_in_first(request: Request) -> Response | None:

@@ -1,7 +1,7 @@
 """Take tasks away from workers that are no longer heard of.
 
-procrastinate's retry strategy never sees a crash, so attempts are capped here: a task that was lost too often fails
-with a sentence and the last lines it wrote. The heartbeat watched is the task's own, not its worker's: a worker
+A worker that crashes reports nothing, so its attempts end here: a task that was lost too often fails with a
+sentence and the last lines it wrote. The heartbeat watched is the task's own, not its worker's: a worker
 whose claim's answer was lost on the way lives on without knowing of the task.
 """
 
@@ -12,7 +12,6 @@ from kiln_schemas.errors import BakeFailed, Problem
 from kiln_schemas.states import TaskState
 from kiln_service import transitions
 from kiln_service.db import Database, TaskRow, Tx
-from kiln_service.jobs import withdraw
 from kiln_service.work import Work, lock_task
 
 log = logging.getLogger(__name__)
@@ -34,8 +33,9 @@ async def _reap_one(database: Database, work: Work, task_id: str, stale_s: float
         still = await tx.one("task_is_stale", id=task_id, seconds=stale_s)
         if task.state is not TaskState.ACTIVE or not still["stale"]:
             return 0
-        log.warning("%s %s of job %s: no heartbeat for %.0f s", task.kind, task.label, job.id, stale_s)
-        idle = await work.end_attempt(
+        ids = {"job_id": job.id, "task_id": task.id, "worker_id": task.worker_id}
+        log.warning("%s %s: no heartbeat for %.0f s", task.kind, task.label, stale_s, extra=ids)
+        await work.end_attempt(
             tx,
             job,
             task,
@@ -44,7 +44,6 @@ async def _reap_one(database: Database, work: Work, task_id: str, stale_s: float
             actor=transitions.COORDINATOR,
             retryable=True,
         )
-    await withdraw(database, idle)
     return 1
 
 

@@ -24,8 +24,9 @@ import uvicorn
 from fastapi import FastAPI
 
 from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, MachineLacks
+from kiln_schemas.logs import LogFormat, set_up
 from kiln_service.app import create_app
-from kiln_service.auth import TOKEN_FILE
+from kiln_service.auth import OWNER_VARIABLE, TOKEN_FILE
 from kiln_service.config import ServiceConfig, make_config
 from kiln_service.embedded import EmbeddedPostgres
 
@@ -79,9 +80,7 @@ class Server(uvicorn.Server):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run; the exit code (errors as in kiln_schemas.errors)."""
     arguments = _parser().parse_args(argv)
-    logging.basicConfig(
-        level=arguments.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr
-    )
+    set_up(LogFormat(arguments.log_format), arguments.log_level)
     try:
         config = _config(arguments)
         _prepare_folder(config.data)
@@ -103,9 +102,11 @@ def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json:
     with _bound(config.host, config.port) as listening:
         host, port = listening.getsockname()[:2]
         url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
-        token_file = str((config.data / TOKEN_FILE).absolute())
+        given = bool(os.environ.get(OWNER_VARIABLE))
+        token_file = None if given else str((config.data / TOKEN_FILE).absolute())
         ready = {"url": url, "token_file": token_file, "data": str(config.data.absolute()), "pid": os.getpid()}
-        announce = json.dumps(ready) if as_json else f"lightkiln serves {url} (token in {token_file})"
+        where = f"given by {OWNER_VARIABLE}" if given else f"in {token_file}"
+        announce = json.dumps(ready) if as_json else f"lightkiln serves {url} (token {where})"
         app = create_app(config)
         server = Server(
             app,
@@ -200,6 +201,7 @@ def _config(arguments: argparse.Namespace) -> ServiceConfig:
         "host": arguments.host,
         "port": arguments.port,
         "database": arguments.database,
+        "storage_url": arguments.storage,
         "store_url": arguments.store,
     }
     tree |= {key: value for key, value in flags.items() if value is not None}
@@ -214,8 +216,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--host", help="address to listen on (127.0.0.1)")
     parser.add_argument("--port", type=int, help="port to listen on (8321; 0 takes a free one)")
     parser.add_argument("--database", help="connection string of a PostgreSQL server (default: an embedded one)")
-    parser.add_argument("--store", help="URL of the folder for light-field stores, file:// or s3://")
+    parser.add_argument("--storage", help="URL of the folder for light fields and blobs, file:// or s3:// (--data)")
+    parser.add_argument("--store", help="URL of the folder for light-field stores alone")
     parser.add_argument("--config", type=Path, help="JSON file with everything else (kiln_service.config)")
     parser.add_argument("--json", action="store_true", help="announce readiness as one JSON line")
+    parser.add_argument("--log-format", default=LogFormat.TEXT.value, choices=[form.value for form in LogFormat])
     parser.add_argument("--log-level", default="info", choices=["debug", "info", "warning", "error"])
     return parser

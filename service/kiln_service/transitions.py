@@ -1,4 +1,4 @@
-"""The only writer of states: every move of a job or a task, its queue job and its event, in one transaction.
+"""The only writer of states: every move of a job or a task and its event, in one transaction.
 
 Each function is one move of the tables in `kiln_schemas.states`; an illegal one raises IllegalTransition. The
 caller has locked the job and, for a move of a task, the task (`Tx`'s order of locks).
@@ -14,7 +14,15 @@ from kiln_schemas.camera import Camera
 from kiln_schemas.errors import IllegalTransition, Problem
 from kiln_schemas.gates import GateResult, Gates, gate_problem
 from kiln_schemas.settings import BakeSettings
-from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState, check_job_move, check_task_move
+from kiln_schemas.states import (
+    CLAIMABLE_TASK_STATES,
+    FINAL_JOB_STATES,
+    TASK_TRANSITIONS,
+    JobState,
+    TaskState,
+    check_job_move,
+    check_task_move,
+)
 from kiln_schemas.tasks import Bundle, Result, TaskKind
 from kiln_service import queue
 from kiln_service.blobs import drop_blobs
@@ -50,6 +58,7 @@ async def create_job(
     actor: str,
     priority: int,
     labels: Mapping[str, str],
+    tags: Sequence[str],
     submission: Submission,
 ) -> JobRow:
     """A new job, queued, with its first tasks."""
@@ -66,6 +75,7 @@ async def create_job(
         store_url=f"{store_base}/{job_id}.zarr",
         priority=priority,
         labels=Jsonb(dict(labels)),
+        tags=list(tags),
         submitter=submission.submitter,
         idempotency_key=submission.key,
         request_sha256=submission.sha256,
@@ -85,31 +95,31 @@ async def add_tasks(tx: Tx, job: JobRow, planned: Sequence[Planned]) -> None:
             "kind": task.kind.value,
             "label": task.label,
             "state": (TaskState.QUEUED if task.ready else TaskState.WAITING).value,
+            "rank": queue.rank(job.priority, task.kind),
             "spec": task.spec,
         }
         for place, task in enumerate(planned)
     ]
     await tx.run("insert_tasks", job_id=job.id, tasks=Jsonb(rows))
-    ready = [(str(row["id"]), task.kind) for row, task in zip(rows, planned, strict=True) if task.ready]
-    await queue.defer(tx, job, ready)
+    if ready := {task.kind for task in planned if task.ready}:
+        await queue.announce(tx, ready)
     counts: dict[str, int] = {}
     for task in planned:
         counts[task.kind.value] = counts.get(task.kind.value, 0) + 1
     await add_event(tx, job.id, "tasks.planned", COORDINATOR, detail=counts)
 
 
-async def release_task(tx: Tx, job: JobRow, task: TaskRow) -> None:
-    """waiting > queued."""
-    if task.state is not TaskState.WAITING:
-        raise IllegalTransition(f"a task that is {task.state} cannot be released")
-    check_task_move(task.state, TaskState.QUEUED)
-    await _move(tx, "move_task_queued", task)
-    await queue.defer(tx, job, [(task.id, task.kind)])
-    await _task_event(tx, task, "task.queued", COORDINATOR)
+async def release_tasks(tx: Tx, job: JobRow, kind: TaskKind) -> None:
+    """waiting > queued, all tasks of a kind of a job."""
+    check_task_move(TaskState.WAITING, TaskState.QUEUED)
+    rows = await tx.all("release_tasks", job_id=job.id, kind=kind, before=TaskState.WAITING)
+    if rows:
+        await queue.announce(tx, [kind])
+        await add_event(tx, job.id, "tasks.queued", COORDINATOR, detail={"kind": kind.value, "count": len(rows)})
 
 
 async def claim_task(tx: Tx, job: JobRow, task: TaskRow, worker: WorkerRow) -> TaskRow:
-    """queued > active under a new attempt; the job's first claim moves it to active too."""
+    """queued, soft-failed > active under a new attempt; the job's first claim moves it to active too."""
     check_task_move(task.state, TaskState.ACTIVE)
     claimed = TaskRow.of(await tx.one("move_task_active", id=task.id, before=task.state, worker_id=worker.id))
     if job.state is JobState.QUEUED:
@@ -118,13 +128,14 @@ async def claim_task(tx: Tx, job: JobRow, task: TaskRow, worker: WorkerRow) -> T
     return claimed
 
 
-async def requeue_task(tx: Tx, job: JobRow, task: TaskRow, kind: str, actor: str, *, strike: bool, reason: str) -> None:
-    """active > queued: another attempt may try; `kind` is the event (`task.retried`, `task.lost`)."""
+async def requeue_task(tx: Tx, task: TaskRow, kind: str, actor: str, *, strike: bool, reason: str) -> None:
+    """active > soft-failed after a strike, > queued otherwise; `kind` is the event (`task.retried`, `task.lost`)."""
+    after = TaskState.SOFT_FAILED if strike or task.strikes else TaskState.QUEUED
     if task.state is not TaskState.ACTIVE:
-        raise IllegalTransition(f"a task that is {task.state} cannot be retried")
-    check_task_move(task.state, TaskState.QUEUED)
-    await _move(tx, "move_task_requeued", task, strikes=int(strike))
-    await queue.retry(tx, job, task.queue_job, (task.id, task.kind))
+        raise IllegalTransition(f"a task that is {task.state} cannot be tried again")
+    check_task_move(task.state, after)
+    await _move(tx, "move_task_requeued", task, after=after, strikes=int(strike))
+    await queue.announce(tx, [task.kind])
     await _task_event(tx, task, kind, actor, {"reason": reason, "strikes": task.strikes + int(strike)})
 
 
@@ -132,30 +143,29 @@ async def complete_task(tx: Tx, task: TaskRow, result: Result) -> None:
     """active > completed."""
     check_task_move(task.state, TaskState.COMPLETED)
     await _move(tx, "move_task_completed", task, result=Jsonb(result.model_dump(mode="json")))
-    await _leave_queue(tx, task)
+    await _need_no_checkpoint(tx, task)
     await _task_event(tx, task, "task.completed", f"worker:{task.worker_id}", {"seconds": result.seconds})
 
 
-async def fail_task(tx: Tx, job: JobRow, task: TaskRow, problem: Problem, actor: str) -> list[int]:
-    """active > failed, and the job with it; returns the queue jobs to withdraw afterwards."""
+async def fail_task(tx: Tx, task: TaskRow, problem: Problem, actor: str) -> None:
+    """active > failed. What that means for the job: `Work.end_attempt`."""
     check_task_move(task.state, TaskState.FAILED)
     await _move(tx, "move_task_ended", task, after=TaskState.FAILED, error=Jsonb(problem.model_dump(mode="json")))
-    await _leave_queue(tx, task)
+    await _need_no_checkpoint(tx, task)
     await _task_event(tx, task, "task.failed", actor, {"problem": problem.model_dump(mode="json")})
-    return await fail_job(tx, job, problem, actor)
 
 
 async def cancel_task(tx: Tx, task: TaskRow, actor: str, reason: str) -> None:
     """active > canceled: its worker was told to stop, or is lost."""
     check_task_move(task.state, TaskState.CANCELED)
     await _move(tx, "move_task_ended", task, after=TaskState.CANCELED, error=None)
-    await _leave_queue(tx, task)
+    await _need_no_checkpoint(tx, task)
     await _task_event(tx, task, "task.canceled", actor, {"reason": reason})
 
 
-async def cancel_idle_tasks(tx: Tx, job: JobRow, actor: str) -> list[int]:
-    """waiting, queued > canceled, all of a job; returns the queue jobs to withdraw in a later transaction."""
-    before = [TaskState.WAITING, TaskState.QUEUED]
+async def cancel_idle_tasks(tx: Tx, job: JobRow, actor: str) -> None:
+    """waiting, queued, soft-failed > canceled, all of a job."""
+    before = [TaskState.WAITING, *CLAIMABLE_TASK_STATES]
     for state in before:
         check_task_move(state, TaskState.CANCELED)
     rows = await tx.all("cancel_idle_tasks", job_id=job.id, before=[state.value for state in before])
@@ -164,7 +174,6 @@ async def cancel_idle_tasks(tx: Tx, job: JobRow, actor: str) -> list[int]:
             await drop_blobs(tx, f"checkpoint:{row['id']}")
     if rows:
         await add_event(tx, job.id, "tasks.canceled", actor, detail={"count": len(rows)})
-    return [row["queue_job"] for row in rows if row["queue_job"] is not None]
 
 
 async def reuse_renders(tx: Tx, job: JobRow, source: str, store_url: str) -> int:
@@ -178,38 +187,52 @@ async def reuse_renders(tx: Tx, job: JobRow, source: str, store_url: str) -> int
     return len(rows)
 
 
-async def pause_job(tx: Tx, job: JobRow, actor: str) -> list[int]:
-    """queued, active > paused; returns the queue jobs to withdraw in a later transaction."""
-    await move_job(tx, job, JobState.PAUSED, actor)
-    return [row["queue_job"] for row in await tx.all("queued_queue_jobs", job_id=job.id)]
-
-
 async def resume_job(tx: Tx, job: JobRow, actor: str) -> JobRow:
-    """paused > queued, or > active where it has begun; its tasks are in the queue again."""
+    """paused > queued, or > active where it has begun."""
     if job.state is not JobState.PAUSED:
         raise IllegalTransition(f"a job that is {job.state} cannot be resumed")
     job = await move_job(tx, job, JobState.ACTIVE if job.started else JobState.QUEUED, actor)
-    await enqueue(tx, job)
+    await queue.announce(tx, list(TaskKind))
     return job
 
 
-async def reopen_job(tx: Tx, job: JobRow, stage: TaskKind, actor: str) -> JobRow:
-    """failed, canceled > queued, with the failed and canceled tasks: queued in `stage`, waiting in later ones."""
-    before = [TaskState.FAILED, TaskState.CANCELED]
+async def reopen_tasks(tx: Tx, job: JobRow, stage: TaskKind, before: Sequence[TaskState], actor: str) -> int:
+    """failed, canceled > queued in `stage`, > waiting in later ones; how many."""
     for state in before:
         check_task_move(state, TaskState.QUEUED)
-    job = await move_job(tx, job, JobState.QUEUED, actor)
-    parameters = {"job_id": job.id, "stage": stage.value, "before": [state.value for state in before]}
-    rows = await tx.all("reopen_tasks", **parameters)
-    await enqueue(tx, job)
+        check_task_move(state, TaskState.WAITING)
+    states = [state.value for state in before]
+    rows = await tx.all("reopen_tasks", job_id=job.id, stage=stage.value, before=states)
+    await tx.run("forget_task_failures", ids=[row["id"] for row in rows])
+    await queue.announce(tx, [stage])
     await add_event(tx, job.id, "tasks.reopened", actor, detail={"count": len(rows), "stage": stage.value})
-    return job
+    return len(rows)
 
 
-async def enqueue(tx: Tx, job: JobRow) -> None:
-    """Put those of a job's queued tasks into the queue that are not there."""
-    rows = await tx.all("queued_outside_of_queue", job_id=job.id)
-    await queue.defer(tx, job, [(row["id"], TaskKind(row["kind"])) for row in rows])
+async def redo_tasks(tx: Tx, job: JobRow, ids: Sequence[str], after: TaskState) -> int:
+    """> queued or waiting, from any state but waiting and canceled: these tasks are done again; how many moved."""
+    apart = (TaskState.WAITING, TaskState.CANCELED)
+    before = [state for state in TaskState if after in TASK_TRANSITIONS[state] and state not in apart]
+    states = [state.value for state in before]
+    rows = await tx.all("redo_tasks", job_id=job.id, ids=list(ids), before=states, after=after)
+    moved = [row["id"] for row in rows]
+    await tx.run("forget_task_failures", ids=moved)
+    for task_id in moved:
+        await drop_blobs(tx, f"checkpoint:{task_id}")
+        await drop_blobs(tx, f"result:{task_id}")
+    return len(moved)
+
+
+async def forgive_worker(tx: Tx, job: JobRow, kind: TaskKind, worker: str, max_attempts: int) -> list[str]:
+    """failed, soft-failed > queued (or soft-failed still, where others failed it too); the tasks' ids."""
+    check_task_move(TaskState.FAILED, TaskState.QUEUED)
+    check_task_move(TaskState.SOFT_FAILED, TaskState.QUEUED)
+    about = {"job_id": job.id, "kind": kind.value, "worker": worker}
+    rows = await tx.all("forgive_tasks", **about, max_attempts=max_attempts)
+    await tx.run("forget_worker_failures", **about)
+    await tx.run("recount_strikes", job_id=job.id, kind=kind.value)
+    await queue.announce(tx, [kind])
+    return [row["id"] for row in rows]
 
 
 async def move_job(
@@ -247,16 +270,13 @@ async def finish_job(tx: Tx, job: JobRow, gates: Sequence[GateResult]) -> None:
     await move_job(tx, job, after, COORDINATOR, error=missed, detail={"gates": measured} if measured else None)
 
 
-async def fail_job(tx: Tx, job: JobRow, problem: Problem, actor: str) -> list[int]:
-    """The job fails with this error and its idle tasks are canceled; returns the queue jobs to withdraw."""
-    idle = await cancel_idle_tasks(tx, job, actor)
+async def fail_job(tx: Tx, job: JobRow, problem: Problem, actor: str) -> None:
+    """The job fails with this error and its idle tasks are canceled."""
+    await cancel_idle_tasks(tx, job, actor)
     await move_job(tx, job, JobState.FAILED, actor, error=problem)
-    return idle
 
 
-async def _leave_queue(tx: Tx, task: TaskRow) -> None:
-    """A task that is over has no queue job and needs no checkpoint."""
-    await queue.finish(tx, task.queue_job)
+async def _need_no_checkpoint(tx: Tx, task: TaskRow) -> None:
     await drop_blobs(tx, f"checkpoint:{task.id}")
 
 

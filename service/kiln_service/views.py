@@ -1,6 +1,7 @@
 """Jobs and tasks as clients see them, with an honest estimate of the time left."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from psycopg.rows import DictRow
@@ -8,9 +9,10 @@ from psycopg.types.json import Jsonb
 
 from kiln_schemas.errors import InputError, NotFound
 from kiln_schemas.job import CurveView, JobPage, JobView, StageView, TaskView
-from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState
+from kiln_schemas.states import FINAL_JOB_STATES, OVER_TASK_STATES, JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
 from kiln_service.db import Database, JobRow, TaskRow, Tx
+from kiln_service.events import EVENT_CHANNEL, Signals, wait
 from kiln_service.planner import METHODS
 
 LEAST_FRACTION: Final = 0.05
@@ -72,19 +74,49 @@ async def curves(database: Database, job_id: str) -> tuple[CurveView, ...]:
     return tuple(CurveView.model_validate(row) for row in rows)
 
 
-async def task_log(database: Database, task_id: str) -> str:
-    """All that the attempts of a task wrote, each under a line that names it."""
+async def task_log(database: Database, task_id: str, tail: int | None = None) -> str:
+    """All that the attempts of a task wrote, each under a line that names it; or the last `tail` lines of that."""
+    text = "".join([piece async for piece in _log_pieces(database, task_id, LogPlace())])
+    return text if tail is None else "".join(text.splitlines(keepends=True)[-tail:])
+
+
+async def follow_log(
+    database: Database, signals: Signals, task_id: str, tail: int | None, poll_s: float
+) -> AsyncIterator[str]:
+    """The same, and what is written from now on until the task is over."""
+    place, over = LogPlace(), False
+    text = "".join([piece async for piece in _log_pieces(database, task_id, place)])
+    yield text if tail is None else "".join(text.splitlines(keepends=True)[-tail:])
+    with signals.watch(EVENT_CHANNEL) as woken:
+        while not over and not signals.stopping:
+            woken.clear()
+            async with database.transaction() as tx:
+                row = await tx.one("find_task", id=task_id)
+            over = TaskState(row["state"]) in OVER_TASK_STATES
+            async for piece in _log_pieces(database, task_id, place):
+                yield piece
+            if not over:
+                await wait(woken, poll_s)
+
+
+@dataclass
+class LogPlace:
+    """How far a log was read."""
+
+    row: int = 0
+    attempt: int | None = None
+
+
+async def _log_pieces(database: Database, task_id: str, place: LogPlace) -> AsyncIterator[str]:
     async with database.transaction() as tx:
         if await tx.maybe("find_task", id=task_id) is None:
             raise NotFound(f"no task '{task_id}'", where="task")
-        rows = await tx.all("task_log", task_id=task_id)
-    parts, attempt = [], None
+        rows = await tx.all("task_log", task_id=task_id, after=place.row)
     for row in rows:
-        if row["attempt"] != attempt:
-            attempt = row["attempt"]
-            parts.append(f"--- attempt {attempt}\n")
-        parts.append(row["lines"] if row["lines"].endswith("\n") else row["lines"] + "\n")
-    return "".join(parts)
+        if row["attempt"] != place.attempt:
+            yield f"--- attempt {row['attempt']}\n"
+        place.row, place.attempt = row["id"], row["attempt"]
+        yield row["lines"] if row["lines"].endswith("\n") else row["lines"] + "\n"
 
 
 async def artifacts(database: Database, job_id: str) -> tuple[Artifact, ...]:
@@ -170,6 +202,7 @@ def _job_view(job: JobRow, rows: dict[str, DictRow]) -> JobView:
         gate_results=job.gate_results,
         priority=job.priority,
         labels=job.labels,
+        tags=job.tags,
         submitter=job.submitter,
         renders_of=job.renders_of,
     )
@@ -182,6 +215,7 @@ def _stage_view(row: DictRow) -> StageView:
         completed=row["completed"],
         active=row["active"],
         failed=row["failed"],
+        soft_failed=row["soft_failed"],
         fraction=(row["completed"] + sum(row["fractions"] or [])) / row["total"],
         seconds=row["seconds"],
     )
@@ -202,6 +236,13 @@ def task_view(task: TaskRow, worker: str | None) -> TaskView:
         finished=task.finished,
         error=task.error,
     )
+
+
+async def require_task(database: Database, task_id: str) -> None:
+    """NotFound where there is no such task."""
+    async with database.transaction() as tx:
+        if await tx.maybe("find_task", id=task_id) is None:
+            raise NotFound(f"no task '{task_id}'", where="task")
 
 
 async def _require_job(tx: Tx, job_id: str) -> None:

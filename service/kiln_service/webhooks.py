@@ -9,9 +9,11 @@ coordinator that starts later. Receivers may be told twice (`X-Lightkiln-Deliver
 import asyncio
 import hashlib
 import hmac
+import ipaddress
 import json
 import logging
 import secrets
+import socket
 import time
 from typing import Final
 
@@ -23,6 +25,8 @@ from psycopg_pool import PoolTimeout
 from kiln_schemas import __version__
 from kiln_schemas.errors import NotFound
 from kiln_schemas.operators import DeliveryView, NewWebhook, WebhookRequest, WebhookView
+from kiln_schemas.receivers import is_refused
+from kiln_schemas.text import told
 from kiln_service.config import Timing
 from kiln_service.db import Database, picked
 from kiln_service.ids import new_id
@@ -104,7 +108,13 @@ class Deliverer:
         outcome = "delivered" if told else "failed" if last else "pending"
         pause = min(LONGEST_PAUSE_S, self._timing.maintenance_s * 2 ** row["attempts"])
         if not told:
-            log.warning("webhook %s: attempt %d failed: %s", row["url"], row["attempts"], error or f"status {status}")
+            log.warning(
+                "webhook %s: attempt %d failed: %s",
+                row["url"],
+                row["attempts"],
+                error or f"status {status}",
+                extra={"job_id": row["job_id"]},
+            )
         async with self._database.transaction() as tx:
             await tx.run("end_delivery", id=row["id"], outcome=outcome, status=status, error=error, pause_s=pause)
 
@@ -134,6 +144,29 @@ async def _send(http: httpx.AsyncClient, row: DictRow) -> tuple[int | None, str 
         "X-Lightkiln-Signature": signature(row["secret"], int(time.time()), body),
     }
     try:
-        return (await http.post(row["url"], content=body, headers=headers)).status_code, None
-    except (httpx.HTTPError, httpx.InvalidURL) as error:
-        return None, str(error) or type(error).__name__
+        async with asyncio.timeout(TIMEOUT_S):
+            url = httpx.URL(row["url"])
+            request = http.build_request(
+                "POST",
+                url.copy_with(host=await _address(url)),
+                content=body,
+                headers=headers | {"Host": url.netloc.decode()},
+                extensions={"sni_hostname": url.host},
+            )
+            reply = await http.send(request, stream=True)
+            await reply.aclose()  # its body is nobody's business, and may have no end
+            return reply.status_code, None
+    except TimeoutError:
+        return None, f"no answer within {TIMEOUT_S:.0f} s"
+    except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError) as error:
+        return None, told(str(error) or type(error).__name__)
+
+
+async def _address(url: httpx.URL) -> str:
+    """Where to connect to: the host's address, looked up once; ValueError where it is one that is refused."""
+    found = await asyncio.get_running_loop().getaddrinfo(url.host, url.port, type=socket.SOCK_STREAM)
+    addresses = [str(entry[4][0]) for entry in found]
+    for address in addresses:
+        if is_refused(ipaddress.ip_address(address)):
+            raise ValueError(f"'{url.host}' is at {address}, to which nothing is sent")
+    return addresses[0]

@@ -1,7 +1,7 @@
 """What workers ask: register, claim, heartbeat, commit, fail, checkpoint.
 
 The fence: a claim increments the task's attempt, every later call carries it, and a call whose attempt is not the
-task's running one is refused with StaleAttempt, for procrastinate itself would take a zombie's finish.
+task's running one is refused with StaleAttempt, so that nothing a zombie says counts.
 Everything that a commit causes (the result, the next stage's release, the job's end) happens in its
 transaction under the job's lock, so the last tile's fan-in happens once.
 """
@@ -35,14 +35,16 @@ from kiln_schemas.tasks import (
 )
 from kiln_service import queue, transitions
 from kiln_service.blobs import drop_blobs, require_blobs, use_blobs
+from kiln_service.blocks import note_failure
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, JobRow, TaskRow, Tx, WorkerRow
 from kiln_service.events import QUEUED_CHANNEL, Signals, add_event, wait
 from kiln_service.ids import new_id
-from kiln_service.jobs import lock_job, settle_cancel, withdraw
+from kiln_service.jobs import lock_job, settle_cancel
 from kiln_service.payloads import build_payload
 from kiln_service.planner import METHODS, plan_after_prepare
 from kiln_service.reuse import renders_to_reuse
+from kiln_service.schedules import is_asleep
 
 RELEASED_CODE: Final = "canceled"
 """A worker that leaves in good order gives its task back with this code; that is no strike against the task."""
@@ -67,9 +69,9 @@ class Work:
             await tx.run(
                 "insert_worker",
                 id=worker_id,
-                **registration.model_dump(exclude={"kinds"}),
+                **registration.model_dump(exclude={"kinds", "tags"}),
                 kinds=[kind.value for kind in registration.kinds],
-                queue_worker=await queue.register_worker(tx),
+                tags=list(registration.tags),
             )
         return worker_id
 
@@ -97,28 +99,34 @@ class Work:
 
     async def _claim_once(self, worker_id: str, kinds: Sequence[TaskKind]) -> "Claim | _Outcome":
         async with self._database.transaction() as tx:
-            worker = await _seen(tx, worker_id)
-            if worker.orders == "drain":
-                raise Drained("an operator told the worker to leave", where=worker.name)
-            if worker.orders == "sleep":
-                return _NOTHING
-            fetched = await queue.fetch(tx, kinds, worker.queue_worker)
-            if fetched is None:
-                return _NOTHING
-            queue_job, task_id = fetched
-            job, task = await lock_task(tx, task_id)
-            paused = job.state is JobState.PAUSED
-            if paused or task.state is not TaskState.QUEUED or task.queue_job != queue_job:
-                await queue.finish(tx, queue_job)
-                return _DROPPED
-            task = await transitions.claim_task(tx, job, task, worker)
-            payload = await build_payload(tx, job, task)
+            worker = await _find_worker(tx, worker_id)
+            found = await self._take(tx, worker, kinds)
+            await tx.run("see_worker", id=worker_id)
+        return found
+
+    async def _take(self, tx: Tx, worker: WorkerRow, kinds: Sequence[TaskKind]) -> "Claim | _Outcome":
+        if worker.orders == "drain":
+            raise Drained("an operator told the worker to leave", where=worker.name)
+        if worker.orders == "sleep" or await is_asleep(tx, worker.name):
+            return _NOTHING
+        stale_s = self._config.timing.stale_s
+        seen = await queue.pick(tx, worker, kinds, stale_s)
+        if seen is None:
+            return _NOTHING
+        job = await lock_job(tx, seen.job_id)
+        # Others that held the lock may have claimed it: look again, now that nobody else can.
+        picked = await queue.pick(tx, worker, kinds, stale_s, job.id)
+        if picked is None:
+            return _GONE
+        task = TaskRow.of(await tx.one("lock_task", id=picked.task_id))
+        task = await transitions.claim_task(tx, job, task, worker)
+        payload = await build_payload(tx, job, task)
         return Claim(task_id=task.id, job_id=job.id, attempt=task.attempt, payload=payload, checkpoint=task.checkpoint)
 
     async def heartbeat(self, worker_id: str, beat: Heartbeat) -> HeartbeatReply:
         """Keep the attempt alive, or tell the worker to stop."""
         async with self._database.transaction() as tx:
-            await _seen(tx, worker_id)
+            await _find_worker(tx, worker_id)
             await _add_log(tx, beat.task_id, beat.attempt, beat.log)
             row = await tx.maybe(
                 "beat_task",
@@ -128,6 +136,7 @@ class Work:
             )
             if row is not None and beat.progress is not None and beat.progress.loss is not None:
                 await tx.run("add_loss", task_id=beat.task_id, step=beat.progress.done, loss=beat.progress.loss)
+            await tx.run("see_worker", id=worker_id)
         if row is None:
             return HeartbeatReply(stop=True, reason="the task was given to another attempt or is over")
         state = JobState(row["job_state"])
@@ -153,10 +162,10 @@ class Work:
             await drop_blobs(tx, f"checkpoint:{task.id}")
             await use_blobs(tx, f"checkpoint:{task.id}", [checkpoint.sha256])
             await tx.run("set_checkpoint", id=task.id, sha256=checkpoint.sha256)
+            await tx.run("forget_task_failures", ids=[task.id])
 
     async def commit(self, task_id: str, commit: Commit) -> None:
         """Take an attempt's result. The same commit again (its answer was lost) is no error."""
-        idle: list[int] = []
         stopped: StaleAttempt | None = None
         async with self._database.transaction() as tx:
             job, task = await lock_task(tx, task_id)
@@ -169,13 +178,12 @@ class Work:
                 await transitions.cancel_task(tx, task, transitions.COORDINATOR, stopped.detail)
                 await settle_cancel(tx, job)
             else:
-                idle = await self._accept(tx, job, task, commit.result)
-        await withdraw(self._database, idle)
+                await self._accept(tx, job, task, commit.result)
         if stopped:
             raise stopped
 
-    async def _accept(self, tx: Tx, job: JobRow, task: TaskRow, result: Result) -> list[int]:
-        """Complete the task, publish what it made, and go on with the job; returns queue jobs to withdraw."""
+    async def _accept(self, tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
+        """Complete the task, publish what it made, and go on with the job."""
         made = _blobs_of(result)
         await _require(tx, made)
         await use_blobs(tx, f"result:{task.id}", made)
@@ -185,7 +193,8 @@ class Work:
             try:
                 planned = plan_after_prepare(result, job.settings, job.gates, self._config.limits.tiles)
             except InputError as error:
-                return await transitions.fail_job(tx, job, error.problem(), transitions.COORDINATOR)
+                await transitions.fail_job(tx, job, error.problem(), transitions.COORDINATOR)
+                return
             source = await renders_to_reuse(tx, job, result)
             if source is None:
                 await transitions.add_tasks(tx, job, planned)
@@ -198,16 +207,15 @@ class Work:
             for artifact in result.artifacts:
                 await tx.run("add_artifact", job_id=job.id, **artifact.model_dump())
         await _fan_in(tx, job, task, result)
-        return []
+        await tx.run("clear_strikes", id=task.worker_id)
 
     async def fail(self, task_id: str, failure: Failure) -> None:
-        """An attempt ended without a result: try again, or fail the task and its job."""
-        idle: list[int] = []
+        """An attempt ended without a result: another may try, or the task fails."""
         async with self._database.transaction() as tx:
             job, task = await lock_task(tx, task_id)
             _check_fence(task, failure.attempt)
             await _add_log(tx, task.id, failure.attempt, failure.log)
-            idle = await self.end_attempt(
+            await self.end_attempt(
                 tx,
                 job,
                 task,
@@ -216,27 +224,37 @@ class Work:
                 actor=f"worker:{task.worker_id}",
                 retryable=failure.retryable,
             )
-        await withdraw(self._database, idle)
 
     async def end_attempt(
         self, tx: Tx, job: JobRow, task: TaskRow, problem: Problem, *, kind: str, actor: str, retryable: bool
-    ) -> list[int]:
+    ) -> None:
         """What follows when the running attempt of a locked task is over without a result.
 
-        Returns queue jobs to withdraw after the transaction. An input error is final, whatever the worker says.
+        Another attempt follows, unless it was the last. A task that fails leaves its job to the tasks that go
+        without it; an input error is final for both, whatever the worker says.
         """
         if job.state not in LIVE_JOB_STATES:
             await transitions.cancel_task(tx, task, actor, f"the job is {job.state}")
             await settle_cancel(tx, job)
-            return []
-        input_error = isinstance(KilnError.from_problem(problem), InputError)
-        released = problem.code == RELEASED_CODE
-        last = not released and task.strikes + 1 >= self._config.max_attempts
-        if retryable and not input_error and not last:
-            reason = problem.sentence()
-            await transitions.requeue_task(tx, job, task, kind, actor, strike=not released, reason=reason)
-            return []
-        return await transitions.fail_task(tx, job, task, problem, actor)
+            return
+        final = isinstance(KilnError.from_problem(problem), InputError)
+        strike = problem.code != RELEASED_CODE
+        if retryable and not final:
+            if strike and await note_failure(tx, job, task, self._config):
+                task, strike = await _lock(tx, task.id), False
+            if not strike or task.strikes + 1 < self._config.max_attempts:
+                reason = problem.sentence()
+                await transitions.requeue_task(tx, task, kind, actor, strike=strike, reason=reason)
+                return
+        await transitions.fail_task(tx, task, problem, actor)
+        if final or await self._too_many_failed(tx, job, task):
+            await transitions.fail_job(tx, job, problem, actor)
+
+    async def _too_many_failed(self, tx: Tx, job: JobRow, task: TaskRow) -> bool:
+        """Whether the job fails with this task: nothing else can be done for it, or its other tasks would fail too."""
+        row = await tx.one("failed_share", job_id=job.id, kind=task.kind)
+        share = self._config.failed_tasks
+        return not row["open"] or (row["failed"] >= share.least and row["failed"] > share.of_all * row["total"])
 
 
 class _Outcome:
@@ -244,8 +262,8 @@ class _Outcome:
 
 
 _NOTHING: Final = _Outcome()
-_DROPPED: Final = _Outcome()
-"""The queue gave a job whose task is not queued any more; look again at once."""
+_GONE: Final = _Outcome()
+"""Somebody else was quicker; look again at once."""
 
 
 async def lock_task(tx: Tx, task_id: str) -> tuple[JobRow, TaskRow]:
@@ -254,22 +272,28 @@ async def lock_task(tx: Tx, task_id: str) -> tuple[JobRow, TaskRow]:
     if owner is None:
         raise NotFound(f"no task '{task_id}'", where="task")
     job = await lock_job(tx, owner["job_id"])
-    return job, TaskRow.of(await tx.one("lock_task", id=task_id))
+    return job, await _lock(tx, task_id)
 
 
-async def _seen(tx: Tx, worker_id: str) -> WorkerRow:
-    """The worker, marked as alive here and in procrastinate."""
-    row = await tx.maybe("see_worker", id=worker_id)
+async def _lock(tx: Tx, task_id: str) -> TaskRow:
+    return TaskRow.of(await tx.one("lock_task", id=task_id))
+
+
+async def _find_worker(tx: Tx, worker_id: str) -> WorkerRow:
+    row = await tx.maybe("find_worker", id=worker_id)
     if row is None:
         raise NotFound(f"no worker '{worker_id}'", where="worker", remedy="Register it with POST /v1/workers.")
-    worker = WorkerRow.of(row)
-    await queue.beat(tx, worker.queue_worker)
-    return worker
+    return WorkerRow.of(row)
 
 
 async def _fan_in(tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
-    """After a completed task: release the next stage, or finish the job, if it was its stage's last."""
+    """After a completed task: release the next stage, or finish the job, if it was its stage's last.
+
+    Where only failed tasks are left of the stage, the job fails with the first of them.
+    """
     if await _unfinished(tx, job, task.kind):
+        if stuck := await tx.maybe("stuck_on", job_id=job.id):
+            await transitions.fail_job(tx, job, Problem.model_validate(stuck["error"]), transitions.COORDINATOR)
         return
     stage = METHODS[job.method].stage_after(task.kind)
     while stage is not None and not await _unfinished(tx, job, stage):
@@ -278,13 +302,12 @@ async def _fan_in(tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
         await transitions.finish_job(tx, job, result.gates if isinstance(result, PackageResult) else ())
         return
     await add_event(tx, job.id, "stage.completed", transitions.COORDINATOR, detail={"kind": task.kind.value})
-    for row in await tx.all("tasks_in_state", job_id=job.id, kind=stage, state=TaskState.WAITING):
-        await transitions.release_task(tx, job, TaskRow.of(row))
+    await transitions.release_tasks(tx, job, stage)
 
 
-async def _unfinished(tx: Tx, job: JobRow, kind: TaskKind) -> int:
-    """Tasks of a kind that have not completed; none also where the job has no such task."""
-    return int((await tx.one("count_unfinished", job_id=job.id, kind=kind))["tasks"])
+async def _unfinished(tx: Tx, job: JobRow, kind: TaskKind) -> bool:
+    """Whether tasks of a kind have not completed; False also where the job has no such task."""
+    return bool((await tx.one("has_unfinished", job_id=job.id, kind=kind))["unfinished"])
 
 
 def _check_fence(task: TaskRow, attempt: int) -> None:

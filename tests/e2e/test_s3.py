@@ -1,4 +1,4 @@
-"""A farm whose light-field store is in a bucket: the package is the one that a bake on one machine makes."""
+"""A farm whose light fields and blobs are in a bucket makes the package that a bake on one machine makes."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from e2e_farm import Farm, digests, lightkiln, settings
 from kiln_service.blobs import open_objects
 
 
-def test_a_store_in_a_bucket(
+def test_a_farm_on_a_bucket(
     s3_server: seaweed.S3Server,
     room_files: tuple[Path, Path],
     baked: Path,
@@ -23,7 +23,8 @@ def test_a_store_in_a_bucket(
     farm = Farm(folder / "farm")
     farm.folder.mkdir()
     try:
-        farm.start_coordinator("--store", f"s3://{s3_server.bucket}/light-fields")
+        storage = f"s3://{s3_server.bucket}/farm"
+        farm.start_coordinator("--storage", storage)
         farm.start_worker("first", "--kinds", "prepare,render", "--threads", "1")
         farm.start_worker("second", "--kinds", "fit,refine,package", "--threads", "1")
         job = farm.submit(*room_files, *settings())
@@ -36,7 +37,13 @@ def test_a_store_in_a_bucket(
     finally:
         farm.stop()
     assert digests(package) == digests(baked)
-    assert not (farm.folder / "data" / "store").exists()
-    assert freed["jobs"][0]["stores"] == [f"s3://{s3_server.bucket}/light-fields/{job}.zarr"] and again["jobs"] == []
-    bucket = open_objects(f"s3://{s3_server.bucket}/light-fields")
-    assert [entry["path"] for page in obstore.list(bucket) for entry in page] == []
+    data = {path.name for path in (farm.folder / "data").iterdir()}
+    assert data == {"incoming", "lock", "postgres", "postgres.log", "token"}, (
+        "nothing else is on the coordinator's disk"
+    )
+    assert freed["jobs"][0]["stores"] == [f"{storage}/store/{job}.zarr"] and again["jobs"] == []
+    bucket = open_objects(storage)
+    left = [entry["path"] for page in obstore.list(bucket) for entry in page]
+    assert left and all(path.startswith("blobs/") for path in left)
+    stored = {path.rpartition("/")[2] for path in left}
+    assert set(digests(package).values()) <= stored, "what was downloaded lies in the bucket"

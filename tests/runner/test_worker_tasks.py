@@ -1,13 +1,16 @@
 """A worker against a recording coordinator: results, failures, cancellations, outages."""
 
+import json
 import threading
 import time
 
 import pytest
 
 from kiln_schemas.errors import AuthError, NotFound
+from kiln_schemas.logs import JsonFormatter
 from kiln_schemas.settings import PRESETS
 from kiln_schemas.tasks import Block, Claim, FitResult, RefinePayload
+from kiln_workers.__main__ import Log
 from kiln_workers.runner.parent import Worker
 
 
@@ -197,3 +200,19 @@ def test_blobs_come_whole(coordinator, worker: Worker) -> None:
         assert weights(coordinator) == b"scenescene"
     # Once damaged, once whole, and from the cache ever after.
     assert len(coordinator.named(f"/v1/blobs/{sha256}")) == 2
+
+
+def test_what_a_worker_logs_bears_the_ids_of_job_and_task(coordinator, worker: Worker, caplog) -> None:
+    caplog.set_level("INFO", "kiln_workers")
+    worker._announce = Log()
+    coordinator.add("print", attempt=3)
+    task = coordinator.claims[0].task_id
+    worker.step()
+    lines = [json.loads(JsonFormatter().format(record)) for record in caplog.records]
+    ends = ("task.claimed", "task.completed")
+    claimed, done = (next(line for line in lines if line["message"] == end) for end in ends)
+    heard = next(line for line in lines if line["message"] == "a line for the log")
+    for line in (claimed, heard, done):
+        found = (line["job_id"], line["task_id"], line["worker_id"], line["kind"], line["attempt"])
+        assert found == ("job", task, "w1", "fit", 3)
+    assert done["seconds"] > 0 and done["level"] == "info"

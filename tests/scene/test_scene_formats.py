@@ -66,7 +66,7 @@ def test_obj_faults(tmp_path):
     for text, says in {
         "v 0 0 0\nf 1 2 3\n": "line 2",
         "v 0 0 x\n": "line 1",
-        "v 0 0\nv 1 0 0\nv 1 1 1\nf 1 2 3": "fewer than 3",
+        "v 0 0\nv 1 0 0\nv 1 1 1\nf 1 2 3": "line 1",
         "v 0 0 nan\nv 1 0 0\nv 1 1 1\nf 1 2 3": "vertex 0",
         "v 0 0 0\nv 1 0 0\nv 1 1 1\nf 1 2": "line 4",
         "v 0 0 0\n": "has no faces",
@@ -236,7 +236,7 @@ def test_names_that_leave_the_bundle_are_refused(tmp_path, name, form):
         ('<shape type="ply"><string name="filename" value="gone.ply"/></shape>', "'gone.ply' is missing"),
         ('<shape type="sphere"><float name="radius" value="nan"/></shape>', "not finite"),
         ('<shape type="cube"><transform name="to_world"><matrix value="1 2"/></transform></shape>', "2 numbers"),
-        ('<include filename="scene.xml"/>', "nest too deeply"),
+        ('<include filename="scene.xml"/>', "included files"),
         ("<shape", "not well-formed"),
         ('<sensor type="perspective"/>', "has no faces"),
     ],

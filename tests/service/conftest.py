@@ -98,14 +98,14 @@ class Coordinator:
     def kinds_of_events(self, job_id: str) -> list[str]:
         return [event["kind"] for event in self.events(job_id)]
 
-    def worker(self, name: str = "w") -> "FakeWorker":
-        return FakeWorker(self, name)
+    def worker(self, name: str = "w", **changes: Any) -> "FakeWorker":
+        return FakeWorker(self, name, **changes)
 
 
 class FakeWorker:
     """What a worker says over HTTP, without doing the work."""
 
-    def __init__(self, coordinator: Coordinator, name: str) -> None:
+    def __init__(self, coordinator: Coordinator, name: str, **changes: Any) -> None:
         self.home, self.name = coordinator, name
         registration = {
             "name": name,
@@ -114,7 +114,7 @@ class FakeWorker:
             "threads": 1,
             "device": "none",
             "version": __version__,
-        }
+        } | changes
         welcome = coordinator.client.post("/v1/workers", json=registration).raise_for_status().json()
         self.id = welcome["worker_id"]
 

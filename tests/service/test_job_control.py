@@ -51,18 +51,17 @@ def test_an_attempt_that_fails_during_a_pause_is_tried_again_after_it(home):
     claim = worker.must_claim()
     act(home, job, "pause").raise_for_status()
     worker.fail(claim).raise_for_status()
-    assert states(home, job, "prepare") == ["queued"] and worker.claim() is None
+    assert states(home, job, "prepare") == ["soft-failed"] and worker.claim() is None
     act(home, job, "resume").raise_for_status()
     assert worker.must_claim()["attempt"] == 2
 
 
-def test_the_reconciler_leaves_a_paused_job_alone(start, fast):
-    with start(timing=fast) as home:
-        job = home.submit()
-        act(home, job, "pause").raise_for_status()
-        assert home.worker().claim(wait_s=1.0) is None
-        act(home, job, "resume").raise_for_status()
-        assert home.worker().must_claim()
+def test_a_claim_that_waits_gets_the_tasks_of_a_resumed_job(home):
+    job, worker = home.submit(), home.worker()
+    act(home, job, "pause").raise_for_status()
+    assert worker.claim(wait_s=0.3) is None
+    act(home, job, "resume").raise_for_status()
+    assert worker.must_claim()
 
 
 def test_a_paused_job_can_be_canceled(home):
@@ -75,7 +74,7 @@ def test_a_failed_job_is_retried_with_what_it_has(home):
     job, worker = home.submit(), home.worker()
     worker.finish(worker.must_claim(), tiles=3)
     worker.finish(worker.must_claim("render"))
-    worker.fail(worker.must_claim("render"), retryable=False, log="no luck").raise_for_status()
+    worker.fail(worker.must_claim("render"), code="input", status=422, log="no luck").raise_for_status()
     assert home.job(job["id"])["state"] == "failed"
     assert sorted(states(home, job, "render")) == ["canceled", "completed", "failed"]
     view = act(home, job, "retry").json()
@@ -181,3 +180,71 @@ def test_a_request_sent_twice_under_a_key_makes_one_job(home):
     assert other.status_code == 422 and first.json()["id"] in other.json()["detail"]
     assert home.client.post("/v1/jobs", json=request).json()["id"] != first.json()["id"]
     assert first.json()["submitter"] == "owner"
+
+
+def requeue(home, job, **wanted):
+    return home.client.post(f"/v1/jobs/{job['id']}/requeue", json=wanted)
+
+
+def finish_all(worker):
+    while (claim := worker.claim()) is not None:
+        worker.finish(claim)
+
+
+def test_some_tiles_of_a_completed_job_are_done_again_and_all_that_follows(home):
+    job, worker = home.submit(), home.worker()
+    worker.finish(worker.must_claim(), tiles=8)
+    finish_all(worker)
+    assert home.job(job["id"])["state"] == "completed"
+    view = requeue(home, job, kind="render", rows=[8, 16], columns=[0, 9]).json()
+    assert view["state"] == "queued" and view["finished"] is None
+    again = [task["label"] for task in home.tasks(job["id"], kind="render", state="queued")]
+    assert again == ["tile 8,0", "tile 8,8"], "tiles of 8 texels, two rows of four"
+    assert set(states(home, job, "fit") + states(home, job, "refine") + states(home, job, "package")) == {"waiting"}
+    assert home.client.get(f"/v1/jobs/{job['id']}/artifacts").json() == []
+    finish_all(worker)
+    assert home.job(job["id"])["state"] == "completed"
+    assert len(home.client.get(f"/v1/jobs/{job['id']}/artifacts").json()) == 2
+    assert "tasks.requeued" in home.kinds_of_events(job["id"])
+
+
+def test_a_worker_of_a_task_that_is_requeued_has_to_stop(home):
+    job, worker = home.submit(), home.worker()
+    worker.advance(job["id"], until="fit")
+    fit = worker.must_claim("fit")
+    requeue(home, job, kind="render").raise_for_status()
+    assert worker.beat(fit)["stop"] is True
+    assert worker.commit(fit, {}).status_code == 422
+    finish_all(worker)
+    assert home.job(job["id"])["state"] == "completed"
+
+
+def test_what_is_not_done_yet_is_not_requeued(home):
+    job, worker = home.submit(), home.worker()
+    worker.finish(worker.must_claim(), tiles=2)
+    refused = requeue(home, job, kind="fit")
+    assert refused.status_code == 409 and "not done yet" in refused.json()["detail"]
+    refused = requeue(home, job, kind="render", rows=[100, 200])
+    assert refused.status_code == 422 and "2 render tasks, none" in refused.json()["detail"]
+    assert requeue(home, job, kind="prepare").status_code == 422
+    act(home, job, "cancel").raise_for_status()
+    assert requeue(home, job, kind="render").status_code == 409
+
+
+def test_a_log_is_followed_to_its_end(home):
+    home.submit()
+    worker = home.worker()
+    claim = worker.must_claim()
+    worker.beat(claim, log="one\ntwo\n")
+    url = f"/v1/tasks/{claim['task_id']}/log"
+    assert home.client.get(url, params={"tail": 1}).text == "two\n"
+    pieces = []
+    with home.client.stream("GET", url, params={"follow": True, "tail": 2}) as stream:
+        for piece in stream.iter_text():
+            pieces.append(piece)
+            if len(pieces) == 1:
+                worker.beat(claim, log="three\n")
+            elif "three" in piece:
+                worker.finish(claim)
+    assert "".join(pieces) == "one\ntwo\nthree\n"
+    assert home.client.get("/v1/tasks/none/log", params={"follow": True}).status_code == 404

@@ -126,20 +126,44 @@ def test_the_record_tells_who_did_what_and_cannot_be_changed(home):
         home.sql("DELETE FROM audit")
 
 
+def test_a_histogram_counts_a_task_at_its_bound_and_beyond_the_last(home):
+    job, worker = home.submit(), home.worker()
+    worker.finish(worker.must_claim(), tiles=3)
+    for seconds in (5.0, 5.1, 1e6):
+        claim = worker.must_claim("render")
+        result = {"kind": "render", "tile": claim["payload"]["tile"], "paths": 1, "overflows": 0, "invalid": 0}
+        assert worker.commit(claim, result | {"seconds": seconds}).status_code == 204
+    families = text_string_to_metric_families(home.client.get("/v1/metrics").text)
+    (family,) = [family for family in families if family.name == "lightkiln_task_seconds"]
+    counted = {s.labels["le"]: s.value for s in family.samples if s.labels.get("le") and s.labels["kind"] == "render"}
+    bounds = ("1.0", "5.0", "15.0", "60.0", "300.0", "900.0", "3600.0", "14400.0", "+Inf")
+    assert [counted[bound] for bound in bounds] == [0, 1, 2, 2, 2, 2, 2, 2, 3]
+    assert job["state"] == "queued"
+
+
 def test_metrics_tell_what_the_farm_does(home):
-    home.submit()
+    job = home.submit()
     worker = home.worker()
     worker.finish(worker.must_claim(), tiles=3)
     worker.finish(worker.must_claim("render"))
     worker.fail(worker.must_claim("render")).raise_for_status()
     reply = home.client.get("/v1/metrics")
     assert reply.headers["content-type"].startswith("text/plain")
-    families = text_string_to_metric_families(reply.text)
+    families = list(text_string_to_metric_families(reply.text))
+    assert len({family.name for family in families}) == len(families)
+    assert all(family.documentation and family.type in ("gauge", "counter", "histogram") for family in families)
+    assert all(s.name.endswith("_total") for f in families if f.type == "counter" for s in f.samples)
     found = {(s.name, *sorted(s.labels.values())): s.value for family in families for s in family.samples}
-    assert found["lightkiln_tasks", "queued", "render"] == 2
+    assert found["lightkiln_tasks", "queued", "render"] == found["lightkiln_tasks", "render", "soft-failed"] == 1
     assert found["lightkiln_tasks", "render", "waiting"] == 0
     assert found["lightkiln_tasks_completed_total", "render"] == 1
-    assert found["lightkiln_task_seconds_total", "prepare"] == 0.5
+    assert found["lightkiln_task_seconds_sum", "prepare"] == 0.5
+    assert [found["lightkiln_task_seconds_bucket", le, "prepare"] for le in ("1.0", "5.0", "+Inf")] == [1, 1, 1]
+    assert found["lightkiln_task_seconds_count", "prepare"] == 1 and found["lightkiln_task_seconds_count", "fit"] == 0
+    size = home.job(job["id"])["settings"]["render"]["image_size"]
+    assert found["lightkiln_store_bytes",] == 5 * size * size * 6
+    assert found["lightkiln_request_seconds_count", "/v1/jobs", "2xx", "POST"] == 1
+    assert found["lightkiln_request_seconds_bucket", "+Inf", "/v1/jobs", "2xx", "POST"] == 1
     assert (found["lightkiln_rendered_texels_total",], found["lightkiln_traced_paths_total",]) == (5, 10)
     assert found["lightkiln_attempts_without_result_total", "failed"] == 1
     assert found["lightkiln_jobs", "active"] == 1 and found["lightkiln_workers", "awake"] == 1

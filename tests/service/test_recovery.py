@@ -1,6 +1,9 @@
-"""Lost workers, failing tasks, a damaged queue."""
+"""Lost workers and failing tasks."""
 
 import time
+from collections import Counter
+
+from kiln_service.config import FailedTasks
 
 
 def attempts(home, job):
@@ -11,7 +14,7 @@ def test_a_task_whose_worker_is_gone_goes_to_another(start, fast, eventually):
     with start(timing=fast) as home:
         job, gone, other = home.submit(), home.worker("gone"), home.worker("other")
         lost = gone.must_claim()
-        eventually(lambda: attempts(home, job) == [("queued", 1)])
+        eventually(lambda: attempts(home, job) == [("soft-failed", 1)])
         claim = other.must_claim()
         assert claim["task_id"] == lost["task_id"] and claim["attempt"] == 2
         assert "task.lost" in home.kinds_of_events(job["id"])
@@ -33,7 +36,7 @@ def test_beating_for_one_task_does_not_keep_another(start, fast, eventually):
         first, second, worker = home.submit(), home.submit(), home.worker()
         worker.must_claim()
         held = worker.must_claim()
-        eventually(lambda: worker.beat(held) and attempts(home, first) == [("queued", 1)])
+        eventually(lambda: worker.beat(held) and attempts(home, first) == [("soft-failed", 1)])
         assert attempts(home, second) == [("active", 1)]
 
 
@@ -53,7 +56,7 @@ def test_a_task_that_is_lost_too_often_fails_with_its_log(start, fast, eventuall
 def test_retryable_failures_are_capped(start):
     with start(max_attempts=3) as home:
         job, worker = home.submit(), home.worker()
-        for state in ("queued", "queued", "failed"):
+        for state in ("soft-failed", "soft-failed", "failed"):
             worker.fail(worker.must_claim()).raise_for_status()
             assert home.tasks(job["id"])[0]["state"] == state
         assert home.job(job["id"])["error"]["detail"] == "it broke"
@@ -67,7 +70,7 @@ def test_a_checkpoint_clears_the_strikes(start):
             claim = worker.must_claim()
             worker.checkpoint(claim, f"step {step}".encode()).raise_for_status()
             worker.fail(claim).raise_for_status()
-        assert home.tasks(job["id"], kind="fit")[0]["state"] == "queued"
+        assert home.tasks(job["id"], kind="fit")[0]["state"] == "soft-failed"
         for state in ("failed",):
             worker.fail(worker.must_claim()).raise_for_status()
             assert home.tasks(job["id"], kind="fit")[0]["state"] == state
@@ -88,42 +91,52 @@ def test_an_input_error_is_final(home):
     assert failed["state"] == "failed" and failed["error"]["code"] == "input"
 
 
-def test_a_failed_task_stops_its_job(home):
+def test_a_failed_task_leaves_the_others_to_go_on(home):
+    job, worker = home.submit(), home.worker()
+    worker.finish(worker.must_claim(), tiles=4)
+    poison = worker.must_claim("render")
+    worker.fail(poison, retryable=False).raise_for_status()
+    assert home.job(job["id"])["state"] == "active"
+    for _ in range(3):
+        worker.finish(worker.must_claim("render"))
+    failed = home.job(job["id"])
+    assert failed["state"] == "failed" and failed["error"]["detail"] == "it broke"
+    states = Counter(task["state"] for task in home.tasks(job["id"]))
+    assert states == {"completed": 4, "failed": 1, "canceled": 3}, "the tiles were done, what follows was not"
+    assert worker.claim() is None
+
+
+def test_a_job_with_failed_tasks_can_be_mended_while_it_goes_on(home):
+    job, worker = home.submit(), home.worker()
+    worker.finish(worker.must_claim(), tiles=2)
+    worker.fail(worker.must_claim("render"), retryable=False).raise_for_status()
+    home.client.post(f"/v1/jobs/{job['id']}/retry").raise_for_status()
+    assert home.client.post(f"/v1/jobs/{job['id']}/retry").status_code == 409
+    while claim := worker.claim():
+        worker.finish(claim)
+    assert home.job(job["id"])["state"] == "completed"
+
+
+def test_an_input_error_of_a_tile_stops_its_job(home):
     job, worker = home.submit(), home.worker()
     worker.finish(worker.must_claim(), tiles=4)
     one, two = worker.must_claim("render"), worker.must_claim("render")
-    worker.fail(one, retryable=False).raise_for_status()
+    worker.fail(one, code="input", status=422).raise_for_status()
     states = sorted(task["state"] for task in home.tasks(job["id"]) if task["kind"] != "prepare")
     assert states == ["active", *(["canceled"] * 5), "failed"]
     assert worker.claim() is None
     assert worker.beat(two) == {"stop": True, "reason": "the job is failed"}
     assert home.tasks(job["id"], state="active") == []
-    assert home.sql("SELECT count(*) AS left FROM procrastinate_jobs") == [{"left": 0}]
 
 
-def test_a_queued_task_without_a_queue_job_is_deferred_again(home, eventually):
-    job = home.submit()
-    home.sql("DELETE FROM procrastinate_jobs")
-    worker = home.worker()
-    claim = worker.must_claim(wait_s=10)
-    assert claim["job_id"] == job["id"]
-    home.sql("DELETE FROM procrastinate_jobs")
-    worker.finish(claim)
-    assert home.tasks(job["id"])[0]["state"] == "completed", "a commit does not need its queue job"
-
-
-def test_a_queue_job_without_a_queued_task_is_dropped(home, eventually):
-    job = home.submit()
-    home.client.post(f"/v1/jobs/{job['id']}/cancel").raise_for_status()
-    task = home.tasks(job["id"])[0]["id"]
-    home.sql(
-        "INSERT INTO procrastinate_jobs (queue_name, task_name, args)"
-        " VALUES ('prepare', 'kiln.task', jsonb_build_object('task_id', %s::text))",
-        task,
-    )
-    assert home.worker().claim() is None
-    eventually(lambda: home.sql("SELECT count(*) AS left FROM procrastinate_jobs") == [{"left": 0}])
-    assert home.tasks(job["id"])[0]["state"] == "canceled"
+def test_a_job_of_which_too_many_tasks_fail_fails_at_once(start):
+    with start(failed_tasks=FailedTasks(least=3, of_all=0.2)) as home:
+        job, worker = home.submit(), home.worker()
+        worker.finish(worker.must_claim(), tiles=16)
+        for state in ("active", "active", "active", "failed"):
+            worker.fail(worker.must_claim("render"), retryable=False).raise_for_status()
+            assert home.job(job["id"])["state"] == state
+        assert worker.claim() is None
 
 
 def test_a_new_coordinator_gives_workers_time_to_return(start, fast):
@@ -145,5 +158,5 @@ def test_two_coordinators_share_the_work(start, fast, eventually):
         worker = two.worker()
         claim = worker.must_claim()
         assert claim["job_id"] == job["id"]
-        eventually(lambda: attempts(one, job) == [("queued", 1)])
+        eventually(lambda: attempts(one, job) == [("soft-failed", 1)])
         assert one.kinds_of_events(job["id"]).count("task.lost") == 1, "one reaper"

@@ -74,6 +74,10 @@ class Farm(RuleBasedStateMachine):
     def act(self, job, action):
         assert self.home.client.post(f"/v1/jobs/{job}/{action}").status_code in EXPECTED
 
+    @rule(job=jobs, kind=st.sampled_from(["render", "fit", "package"]))
+    def requeue(self, job, kind):
+        assert self.home.client.post(f"/v1/jobs/{job}/requeue", json={"kind": kind}).status_code in EXPECTED | {422}
+
     @rule(number=st.integers(0, 1))
     def claim(self, number):
         found = self.workers[number].claim()
@@ -116,23 +120,12 @@ class Farm(RuleBasedStateMachine):
             elif state != "archived":
                 assert artifacts[row["id"]] == 0
             if state in LIVE_JOB_STATES:
-                assert counts["queued"] + counts["active"] > 0, "a live job has something to do"
-                assert counts["failed"] == counts["canceled"] == 0
+                assert counts["queued"] + counts["soft-failed"] + counts["active"] > 0, "a live job has something to do"
+                assert counts["canceled"] == 0
             elif state == "cancel-requested":
-                assert counts["active"] > 0 and counts["queued"] == counts["waiting"] == 0
+                assert counts["active"] > 0 and counts["queued"] == counts["soft-failed"] == counts["waiting"] == 0
             else:
-                assert counts["queued"] == counts["waiting"] == 0
-
-    @invariant()
-    def what_is_queued_is_in_the_queue(self):
-        if not getattr(self, "mine", []):
-            return
-        lost = self.rows(
-            "SELECT tasks.id FROM tasks JOIN jobs ON jobs.id = tasks.job_id AND jobs.state IN ('queued', 'active')"
-            " LEFT JOIN procrastinate_jobs AS queue ON queue.id = tasks.queue_job AND queue.status = 'todo'"
-            " WHERE jobs.id = ANY(%s) AND tasks.state = 'queued' AND queue.id IS NULL"
-        )
-        assert lost == []
+                assert counts["queued"] == counts["soft-failed"] == counts["waiting"] == 0
 
     @invariant()
     def the_history_ends_in_the_state(self):

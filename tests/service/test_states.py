@@ -19,20 +19,20 @@ from kiln_service.work import lock_task
 
 def moves(row, job):
     """Every move of a task by name, as a function of a transaction."""
-    worker = WorkerRow(id=row.worker_id or "", name="w", kinds=(), queue_worker=1, orders="work")
+    worker = WorkerRow(id=row.worker_id or "", name="w", kinds=(), tags=(), orders="work")
     problem = transitions.IllegalTransition("x").problem()
     return {
-        "release": lambda tx: transitions.release_task(tx, job, row),
         "claim": lambda tx: transitions.claim_task(tx, job, row, worker),
-        "requeue": lambda tx: transitions.requeue_task(tx, job, row, "task.retried", "test", strike=True, reason=""),
-        "fail": lambda tx: transitions.fail_task(tx, job, row, problem, "test"),
+        "requeue": lambda tx: transitions.requeue_task(tx, row, "task.retried", "test", strike=True, reason=""),
+        "fail": lambda tx: transitions.fail_task(tx, row, problem, "test"),
         "cancel": lambda tx: transitions.cancel_task(tx, row, "test", ""),
     }
 
 
 ALLOWED = {
-    TaskState.WAITING: {"release", "cancel"},
+    TaskState.WAITING: {"cancel"},
     TaskState.QUEUED: {"claim", "cancel"},
+    TaskState.SOFT_FAILED: {"claim", "cancel"},
     TaskState.ACTIVE: {"requeue", "fail", "cancel"},
     TaskState.COMPLETED: set(),
     TaskState.FAILED: set(),
@@ -68,7 +68,7 @@ def test_a_task_makes_exactly_the_moves_of_the_table(home):
         return {
             state: {
                 name
-                for name in ("release", "claim", "requeue", "fail", "cancel")
+                for name in ("claim", "requeue", "fail", "cancel")
                 if await try_move(home.config.database, claim["task_id"], state, name)
             }
             for state in TaskState

@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
@@ -116,3 +117,45 @@ def test_only_the_events_asked_for_are_told_and_none_after_the_removal(start, fa
 )
 def test_urls_that_are_refused(shared, url):
     assert shared.client.post("/v1/webhooks", json={"url": url}).status_code == 422
+
+
+def test_a_name_is_looked_up_and_sent_as_the_host(start, fast, receiver, eventually):
+    with start(timing=fast) as home:
+        port = receiver.server_address[1]
+        home.client.post("/v1/webhooks", json={"url": f"http://localhost:{port}/hook"}).raise_for_status()
+        fail_a_job(home)
+        eventually(lambda: receiver.told)
+        assert receiver.told[0][0]["Host"] == f"localhost:{port}"
+
+
+def test_a_name_at_a_refused_address_is_not_called(start, fast, receiver, eventually, monkeypatch):
+    """Names are held to the rule when they are looked up: they may point elsewhere than when they were given."""
+    monkeypatch.setattr("kiln_service.webhooks.is_refused", lambda address: address.is_loopback)
+    with start(timing=fast) as home:
+        url = f"http://localhost:{receiver.server_address[1]}/hook"
+        hook = home.client.post("/v1/webhooks", json={"url": url}).raise_for_status().json()
+        fail_a_job(home)
+        (delivery,) = eventually(lambda: [d for d in deliveries(home, hook) if d["error"]])
+        assert "to which nothing is sent" in delivery["error"] and delivery["status"] is None
+        assert receiver.told == []
+
+
+def test_an_answer_without_an_end_is_not_waited_for(start, fast, receiver, eventually):
+    """Its status is all that counts; the connection is closed on it."""
+
+    def answer(self) -> None:
+        self.send_response(200)
+        self.end_headers()
+        with suppress(ConnectionError):
+            while True:
+                self.wfile.write(b"x" * 65536)
+        self.server.told.append("hung up")
+        self.close_connection = True
+
+    receiver.RequestHandlerClass = type("Endless", (Receiver,), {"do_POST": answer})
+    with start(timing=fast) as home:
+        hook = add(home, receiver)
+        fail_a_job(home)
+        (delivery,) = eventually(lambda: [d for d in deliveries(home, hook) if d["outcome"] == "delivered"])
+        assert delivery["status"] == 200
+        eventually(lambda: receiver.told == ["hung up"])

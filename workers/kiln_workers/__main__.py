@@ -6,6 +6,7 @@ can run them directly. Exit codes are those of `kiln_schemas.errors`, and 2 for 
 
 import argparse
 import json
+import logging
 import os
 import platform
 import re
@@ -19,10 +20,13 @@ from pathlib import Path
 from typing import Any
 
 from kiln_schemas.errors import AuthError, InputError, InternalError, KilnError, MachineLacks
-from kiln_schemas.tasks import TaskKind
+from kiln_schemas.logs import LogFormat, set_up
+from kiln_schemas.tasks import TaskKind, read_tags
 from kiln_workers.compare.arguments import add_compare
 from kiln_workers.runner.machine import claim_folder, cores, default_memory_bytes, parse_size
 from kiln_workers.shade.arguments import add_commands
+
+log = logging.getLogger("kiln_workers")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,10 +50,17 @@ def _parser() -> argparse.ArgumentParser:
     worker.add_argument("--token", default=os.environ.get("LIGHTKILN_TOKEN"), help="or LIGHTKILN_TOKEN")
     worker.add_argument("--token-file", type=Path, help="file that holds the token")
     worker.add_argument("--kinds", default=",".join(TaskKind), help="kinds of tasks to take, separated by commas")
+    worker.add_argument("--tag", action="append", default=[], help="what it is good for, for jobs that require it")
     worker.add_argument("--memory", help="main memory to use, e.g. 4GiB")
     worker.add_argument("--threads", type=int, help="cores to use; all by default")
     worker.add_argument("--name", help="as the dashboard shows it; host name and process by default")
     worker.add_argument("--scratch", type=Path, help="folder for temporary files and the blob cache")
+    worker.add_argument(
+        "--log-format",
+        default=LogFormat.TEXT.value,
+        choices=[form.value for form in LogFormat],
+        help="on standard error: lines for people, or JSON with job and task ids",
+    )
     worker.add_argument("--json", action="store_true", help="one JSON object a line on standard output")
     worker.set_defaults(command=_worker)
 
@@ -78,7 +89,10 @@ def _worker(options: argparse.Namespace) -> int:
         raise InputError(f"{threads} threads are refused", where="--threads", remedy="Give 1 or more.")
     memory = parse_size(options.memory) if options.memory else default_memory_bytes()
     folder, lock = claim_folder(options.scratch)
-    announce = _print_json if options.json else _print_line
+    structured = options.log_format == LogFormat.JSON
+    announce = _print_json if options.json else Log() if structured else _print_line
+    if structured:
+        set_up(LogFormat.JSON)
     with lock:
         Worker(
             WorkerOptions(
@@ -86,6 +100,7 @@ def _worker(options: argparse.Namespace) -> int:
                 token=token,
                 name=options.name or f"{platform.node()}-{os.getpid()}",
                 kinds=kinds,
+                tags=read_tags(options.tag),
                 memory_bytes=memory,
                 threads=threads,
                 folder=folder,
@@ -146,6 +161,30 @@ def _kinds(text: str) -> tuple[TaskKind, ...]:
 
 def _print_json(event: str, detail: dict[str, Any]) -> None:
     print(json.dumps({"event": event, **detail}), flush=True)
+
+
+class Log:
+    """Logs what happens in the coordinator's terms, with the worker's id once it is registered."""
+
+    def __init__(self) -> None:
+        self._worker: dict[str, Any] = {}
+
+    def __call__(self, event: str, detail: dict[str, Any]) -> None:
+        """Log one event; a child's line is the message itself."""
+        fields = {_FIELDS.get(name, name): value for name, value in detail.items()}
+        if event == "worker.registered":
+            self._worker = {"worker_id": fields["worker_id"]}
+        line = fields.pop("line", None)
+        bad = event in ("task.failed", "coordinator.away")
+        log.log(
+            logging.WARNING if bad else logging.INFO,
+            "%s",
+            event if line is None else line,
+            extra=self._worker | fields,
+        )
+
+
+_FIELDS = {"task": "task_id", "job": "job_id", "worker": "worker_id", "message": "reason"}
 
 
 def _print_line(event: str, detail: dict[str, Any]) -> None:

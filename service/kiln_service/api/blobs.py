@@ -58,4 +58,4 @@ async def download(sha256: Sha256Path, request: Request, parts: PartsHere) -> Re
     if request.method == "HEAD":
         await parts.blobs.missing([sha256])  # who asks is about to rely on it: not collected within the grace period
     size = await parts.blobs.size(sha256)
-    return serve_blob(request, parts.blobs, sha256, size, "application/octet-stream")
+    return await serve_blob(request, parts.blobs, sha256, size, "application/octet-stream")

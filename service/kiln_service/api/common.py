@@ -78,18 +78,25 @@ _MEANINGS: Final = {
     413: "Too large",
     416: "The range is not in the file",
     422: "The input is not usable",
+    429: "Asked too often; Retry-After says how long to wait",
+    503: "The database does not answer",
     507: "No space",
 }
 
 
 def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI responses: problem documents with these codes, and those that every route may give."""
+    """OpenAPI responses of a route: problem documents with these codes, and those for want of a token or a scope."""
+    return problem_answers(401, 403, 429, *codes)
+
+
+def problem_answers(*codes: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI responses: problem documents with these codes."""
     return {
         code: {
             "description": _MEANINGS[code],
             "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
         }
-        for code in sorted({401, 403, *codes})
+        for code in sorted(set(codes))
     }
 
 

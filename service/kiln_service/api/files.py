@@ -10,7 +10,10 @@ from kiln_schemas.errors import InputError
 from kiln_service.blobs import Blobs
 from kiln_service.problems import problem_response
 
-_RANGE: Final = re.compile(r"bytes=(\d*)-(\d*)")
+_RANGE: Final = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
+
+INERT: Final = {"X-Content-Type-Options": "nosniff", "Content-Security-Policy": "sandbox"}
+"""A page among the files, shown by a browser, has no script and is not of the coordinator's origin."""
 
 
 def parse_range(header: str, size: int) -> tuple[int, int] | None:
@@ -39,10 +42,10 @@ def matches(header: str | None, etag: str) -> bool:
     return etag in names or names == ["*"]
 
 
-def serve_blob(request: Request, blobs: Blobs, sha256: str, size: int, media_type: str) -> Response:
+async def serve_blob(request: Request, blobs: Blobs, sha256: str, size: int, media_type: str) -> Response:
     """The answer to GET or HEAD of a blob."""
     etag = f'"{sha256}"'
-    headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": "private, no-cache"}
+    headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": "private, no-cache"} | INERT
     if matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     wanted = request.headers.get("range")
@@ -60,6 +63,5 @@ def serve_blob(request: Request, blobs: Blobs, sha256: str, size: int, media_typ
         headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
     if request.method == "HEAD":
         return Response(headers=headers, media_type=media_type)
-    return StreamingResponse(
-        blobs.read(sha256, start, end), status_code=206 if part else 200, headers=headers, media_type=media_type
-    )
+    pieces = await blobs.read(sha256, start, end)
+    return StreamingResponse(pieces, status_code=206 if part else 200, headers=headers, media_type=media_type)

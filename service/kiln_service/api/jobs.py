@@ -6,7 +6,17 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 
 from kiln_schemas.errors import InputError
-from kiln_schemas.job import CurveView, EventView, JobChange, JobPage, JobRequest, JobView, TaskView, read_labels
+from kiln_schemas.job import (
+    CurveView,
+    EventView,
+    JobChange,
+    JobPage,
+    JobRequest,
+    JobView,
+    RequeueRequest,
+    TaskView,
+    read_labels,
+)
 from kiln_schemas.operators import Scope
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
@@ -17,6 +27,9 @@ from kiln_service.auth import Principal
 from kiln_service.events import BATCH, is_over, read_events, stream_events
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
+
+UNBUFFERED: Final = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+"""Headers of a stream, so that no proxy holds it back."""
 
 Reader = Depends(caller(Scope.READ))
 Submitter = Annotated[Principal, Depends(caller(Scope.SUBMIT))]
@@ -100,8 +113,15 @@ async def resume(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
 
 @router.post("/jobs/{job_id}/retry", responses=problems(404, 409))
 async def retry(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
-    """Do a failed or canceled job's unfinished tasks again; what has completed stays."""
+    """Do a failed or canceled job's unfinished tasks again, or a live one's failed tasks; what has completed stays."""
     await jobs.retry(parts.database, job_id, who.actor)
+    return await views.job_view(parts.database, job_id)
+
+
+@router.post("/jobs/{job_id}/requeue", responses=problems(404, 409, 422))
+async def requeue(job_id: str, wanted: RequeueRequest, parts: PartsHere, who: Submitter) -> JobView:
+    """Do tasks again though they are done, and all that follows from them; a completed job's artifacts go meanwhile."""
+    await jobs.requeue(parts.database, job_id, wanted, who.actor)
     return await views.job_view(parts.database, job_id)
 
 
@@ -126,10 +146,25 @@ async def curves(job_id: str, parts: PartsHere) -> tuple[CurveView, ...]:
     return await views.curves(parts.database, job_id)
 
 
-@router.get("/tasks/{task_id}/log", dependencies=[Reader], responses=problems(404), response_class=PlainTextResponse)
-async def log(task_id: str, parts: PartsHere) -> PlainTextResponse:
+@router.get(
+    "/tasks/{task_id}/log",
+    dependencies=[Reader],
+    response_class=PlainTextResponse,
+    response_model=None,
+    responses=problems(404, 422),
+)
+async def log(
+    task_id: str,
+    parts: PartsHere,
+    tail: Annotated[int | None, Query(ge=0, le=100_000, description="only so many of the last lines")] = None,
+    follow: Annotated[bool, Query(description="stay, and send what is written until the task is over")] = False,
+) -> Response:
     """What the task's attempts wrote."""
-    return PlainTextResponse(await views.task_log(parts.database, task_id))
+    if not follow:
+        return PlainTextResponse(await views.task_log(parts.database, task_id, tail))
+    await views.require_task(parts.database, task_id)
+    stream = views.follow_log(parts.database, parts.signals, task_id, tail, parts.config.timing.poll_s)
+    return StreamingResponse(stream, media_type="text/plain; charset=utf-8", headers=UNBUFFERED)
 
 
 @router.get(
@@ -163,9 +198,7 @@ async def events(
     if await is_over(parts.database, job_id, start):
         return Response(status_code=204)
     stream = stream_events(parts.database, parts.signals, job_id, start, parts.config.timing.poll_s)
-    return StreamingResponse(
-        stream, media_type="text/event-stream", headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    )
+    return StreamingResponse(stream, media_type="text/event-stream", headers=UNBUFFERED)
 
 
 @router.get("/jobs/{job_id}/artifacts", dependencies=[Reader], responses=problems(404))
@@ -191,7 +224,7 @@ _ARTIFACT: Final[dict[str, Any]] = {
 async def artifact(job_id: str, name: str, request: Request, parts: PartsHere) -> Response:
     """Download an artifact, whole or a range of it."""
     found = await views.artifact(parts.database, job_id, name)
-    return serve_blob(request, parts.blobs, found.sha256, found.size, found.media_type)
+    return await serve_blob(request, parts.blobs, found.sha256, found.size, found.media_type)
 
 
 def _event_id(header: str | None) -> int:

@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from kiln_schemas.operators import (
     AuditEntry,
@@ -13,6 +13,7 @@ from kiln_schemas.operators import (
     NewWebhook,
     Order,
     Scope,
+    SleepSchedule,
     TokenRequest,
     TokenView,
     WebhookRequest,
@@ -26,6 +27,7 @@ from kiln_service.auth import Principal
 router = APIRouter(prefix="/v1", tags=["operators"])
 
 Reader = Depends(caller(Scope.READ))
+WorkerName = Annotated[str, Path(min_length=1, max_length=128, description="a worker's name")]
 Admin = Annotated[Principal, Depends(caller(Scope.ADMIN))]
 
 
@@ -39,6 +41,24 @@ async def workers(parts: PartsHere) -> tuple[WorkerView, ...]:
 async def order(worker_id: str, order: Order, parts: PartsHere, who: Admin) -> None:
     """Tell a worker to sleep, to wake, or to leave once its task is done."""
     await operators.order_worker(parts.database, worker_id, order, who.actor)
+
+
+@router.delete("/workers/{worker_id}/blocks", status_code=204, responses=problems(404))
+async def unblock(worker_id: str, parts: PartsHere, who: Admin) -> None:
+    """Let a worker take tasks of all jobs again, though it failed some."""
+    await operators.unblock_worker(parts.database, worker_id, who.actor)
+
+
+@router.put("/schedules/{worker}", status_code=204, responses=problems(422))
+async def set_schedule(worker: WorkerName, schedule: SleepSchedule, parts: PartsHere, who: Admin) -> None:
+    """Let workers of this name sleep at given times."""
+    await operators.set_schedule(parts.database, worker, schedule, who.actor)
+
+
+@router.delete("/schedules/{worker}", status_code=204, responses=problems(422))
+async def drop_schedule(worker: WorkerName, parts: PartsHere, who: Admin) -> None:
+    """Let them sleep only when they are told to."""
+    await operators.drop_schedule(parts.database, worker, who.actor)
 
 
 @router.get("/tokens", responses=problems())
@@ -109,6 +129,7 @@ async def collect_garbage(request: GcRequest, parts: PartsHere, who: Admin) -> G
     response_class=Response,
     responses=problems() | {200: {"description": "In Prometheus' text format", "content": {"text/plain": {}}}},
 )
-async def prometheus(parts: PartsHere) -> Response:
-    """Queue, tasks, workers and storage for Prometheus."""
-    return Response(await metrics.text(parts.database), media_type=metrics.MEDIA_TYPE)
+async def prometheus(parts: PartsHere, request: Request) -> Response:
+    """Queue, tasks, workers, storage and this coordinator's requests for Prometheus."""
+    own: metrics.RequestSeconds = request.app.state.request_seconds
+    return Response(await metrics.text(parts.database) + own.text(), media_type=metrics.MEDIA_TYPE)

@@ -128,9 +128,8 @@ def _joined(referrer: str, reference: str) -> str:
             check_bundle_path(reference)
         return check_bundle_path(path)
     except InputError as error:
-        raise InputError(
-            f"the file name '{reference}' leaves the scene's folder", where=referrer, remedy=error.remedy
-        ) from None
+        why = error.detail.replace("the bundle", "the scene's folder")
+        raise InputError(f"the file name {why}", where=referrer, remedy=error.remedy) from None
 
 
 References = Iterator[tuple[str, str]]
@@ -176,8 +175,7 @@ def _obj(folder: Path, name: str) -> References:
     """Material libraries and their maps; a library that is missing is left out, as the reader does, who notes it."""
     for arguments in _statements(folder / name, {"mtllib"}):
         # A name may hold spaces, and a statement may hold several names: the file system decides.
-        whole = (folder / name).parent / arguments
-        for library in [arguments] if whole.is_file() else arguments.split():
+        for library in [arguments] if (folder / _joined(name, arguments)).is_file() else arguments.split():
             path = _joined(name, library)
             if (folder / path).is_file():
                 yield path, name
@@ -213,13 +211,24 @@ def _map_file(arguments: str) -> str:
     return " ".join(words)
 
 
+class _Elements(ElementTree.TreeBuilder):
+    """Builds the tree of a file that declares no document type, hence no entities, in whatever encoding."""
+
+    def __init__(self, where: str) -> None:
+        super().__init__()
+        self._where = where
+
+    def doctype(self, *_: str | None) -> None:
+        """Called before any entity is declared."""
+        raise InputError(
+            "document types and entities are refused", where=self._where, remedy="Remove them from the XML."
+        )
+
+
 def _mitsuba_xml(folder: Path, name: str) -> References:
-    data = (folder / name).read_bytes()
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise InputError("document types and entities are refused", where=name, remedy="Remove them from the XML.")
     try:
-        root = ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
+        root = ElementTree.fromstring((folder / name).read_bytes(), ElementTree.XMLParser(target=_Elements(name)))
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two of encodings
         raise InputError(f"is not XML: {error}", where=name, remedy="Export the scene again.") from None
     defaults = {node.get("name", ""): node.get("value", "") for node in root.iter("default")}
     for node in root.iter("string"):

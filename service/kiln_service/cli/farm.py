@@ -43,6 +43,9 @@ PERMANENT: Final = frozenset({2, InputError.exit_code, AuthError.exit_code, Mach
 """Exit codes after which a restart would end the same way."""
 TAIL_LINES: Final = 5
 
+OWNER_VARIABLE: Final = "LIGHTKILN_OWNER_TOKEN"
+"""Names the token of another coordinator (`kiln_service.auth`); the one here makes its own."""
+
 Say = Callable[[str], None]
 
 
@@ -69,6 +72,7 @@ class Managed:
                 stdout=output,
                 stderr=output,
                 start_new_session=True,
+                env={name: value for name, value in os.environ.items() if name != OWNER_VARIABLE},
             )
 
     def revive(self, say: Say) -> None:

@@ -21,9 +21,10 @@ from kiln_schemas import __version__
 from kiln_schemas.errors import DISK_FULL, InputError, KilnError, MachineLacks
 from kiln_schemas.gates import check_gates, read_cameras, read_gates
 from kiln_schemas.job import DEFAULT_PRIORITY, JobRequest, JobView, read_labels
+from kiln_schemas.logs import LogFormat
 from kiln_schemas.settings import make_settings
 from kiln_schemas.states import FINAL_JOB_STATES, PUBLISHED_JOB_STATES, JobState
-from kiln_schemas.tasks import TaskKind
+from kiln_schemas.tasks import TaskKind, read_tags
 from kiln_service.cli import bake as baking
 from kiln_service.cli import options
 from kiln_service.cli.become import become
@@ -139,15 +140,20 @@ def serve(
     database: Annotated[
         str | None, typer.Option("--database", metavar="DSN", help="PostgreSQL; an embedded one by default.")
     ] = None,
+    storage: Annotated[
+        str | None,
+        typer.Option("--storage", metavar="URL", help="Light fields and blobs: file:// or s3://; --data by default."),
+    ] = None,
     store: Annotated[
-        str | None, typer.Option("--store", metavar="URL", help="Light-field stores: file:// or s3://.")
+        str | None, typer.Option("--store", metavar="URL", help="Light-field stores alone: file:// or s3://.")
     ] = None,
     config: Annotated[Path | None, typer.Option("--config", metavar="FILE", help="JSON with all settings.")] = None,
+    log_format: options.LogLines = LogFormat.TEXT,
     json: options.Json = False,
 ) -> None:
     """Run a coordinator."""
-    command = ["--host", host, "--port", str(port), "--data", str(data)]
-    for flag, value in (("--database", database), ("--store", store), ("--config", config)):
+    command = ["--host", host, "--port", str(port), "--data", str(data), "--log-format", log_format.value]
+    for flag, value in (("--database", database), ("--storage", storage), ("--store", store), ("--config", config)):
         command += [flag, str(value)] if value is not None else []
     become("kiln_service", [*command, *(["--json"] if json else [])])
 
@@ -165,13 +171,14 @@ def worker(
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Cores to use; all by default.")] = None,
     name: Annotated[str | None, typer.Option("--name", help="As the dashboard shows it.")] = None,
     scratch: Annotated[Path | None, typer.Option("--scratch", help="Folder for temporary files.")] = None,
+    log_format: options.LogLines = LogFormat.TEXT,
     json: options.Json = False,
 ) -> None:
     """Work for a coordinator until told to stop."""
     # The token goes by the environment: command lines are visible to every user of the machine.
     if token_file is None:
         os.environ["LIGHTKILN_TOKEN"] = token or options.read_token(data)
-    command = ["worker", "--url", url, "--kinds", kinds]
+    command = ["worker", "--url", url, "--kinds", kinds, "--log-format", log_format.value]
     flags = (("--token-file", token_file), ("--memory", memory), ("--threads", threads), ("--name", name))
     for flag, value in (*flags, ("--scratch", scratch)):
         command += [flag, str(value)] if value is not None else []
@@ -191,6 +198,7 @@ def submit(
     name: Annotated[str | None, typer.Option("--name", help="The job's name; the file's by default.")] = None,
     priority: options.JobPriority = DEFAULT_PRIORITY,
     label: options.Label = None,
+    tag: options.Tag = None,
     key: Annotated[
         str | None,
         typer.Option("--idempotency-key", help="Sent twice under the same key, a request makes one job."),
@@ -222,6 +230,7 @@ def submit(
         cameras=cameras,
         priority=priority,
         labels=read_labels(label or ()),
+        tags=read_tags(tag or ()),
     )
     with options.connect(url, token, data) as api:
         job = upload_and_submit(api, local, request, key=key)

@@ -9,7 +9,17 @@ from rich.table import Table
 
 from kiln_schemas.client import Client
 from kiln_schemas.errors import InputError
-from kiln_schemas.operators import GcRequest, JobEvent, Order, Scope, TokenRequest, WebhookRequest, WorkerView
+from kiln_schemas.operators import (
+    DAYS,
+    GcRequest,
+    JobEvent,
+    Order,
+    Scope,
+    SleepSchedule,
+    TokenRequest,
+    WebhookRequest,
+    WorkerView,
+)
 from kiln_service.cli import options
 from kiln_service.cli.output import notices, print_json, results
 
@@ -63,11 +73,12 @@ def list_workers(
     if json:
         print_json([view.model_dump(mode="json") for view in views])
         return
-    table = Table("worker", "name", "state", "task", "kinds", "threads", "device", "seen", box=None)
+    table = Table("worker", "name", "state", "task", "kinds", "tags", "threads", "device", "blocked", "seen", box=None)
     for view in views:
         kinds = ",".join(view.kinds)
-        cells = (view.id, view.name, view.state.value, view.task or "", kinds, str(view.threads), view.device)
-        table.add_row(*map(escape, cells), f"{view.seen:%Y-%m-%d %H:%M:%S}")
+        blocked = ", ".join(f"{block.kind} of {block.job_id[-8:]}" for block in view.blocks)
+        cells = (view.id, view.name, view.state.value, view.task or "", kinds, ",".join(view.tags), str(view.threads))
+        table.add_row(*map(escape, (*cells, view.device, blocked)), f"{view.seen:%Y-%m-%d %H:%M:%S}")
     results.print(table)
 
 
@@ -94,6 +105,75 @@ def _order(order: Order):  # type: ignore[no-untyped-def]  # typer reads the par
 workers_app.command("drain", help="Let it finish its task and leave: its process ends.")(_order(Order.DRAIN))
 workers_app.command("sleep", help="Let it finish its task and take no other.")(_order(Order.SLEEP))
 workers_app.command("wake", help="Let it take tasks again.")(_order(Order.WAKE))
+
+
+@workers_app.command()
+def unblock(
+    worker: Worker,
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Let a worker take tasks of all jobs again, though it failed some."""
+    with options.connect(url, token, data) as api:
+        found = _named(api, worker)
+        for view in found:
+            api.unblock_worker(view.id)
+    if json:
+        print_json({"unblocked": [view.id for view in found]})
+    else:
+        results.print("\n".join(f"{view.name} ({view.id}): unblocked" for view in found), markup=False)
+
+
+@workers_app.command()
+def schedule(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the workers.")],
+    days: Annotated[
+        str | None, typer.Option("--days", metavar="DAYS", help="As in mon,tue or mon-fri; all by default.")
+    ] = None,
+    begins: Annotated[str | None, typer.Option("--from", metavar="HH:MM", help="When they fall asleep.")] = None,
+    ends: Annotated[str | None, typer.Option("--to", metavar="HH:MM", help="When they wake up.")] = None,
+    timezone: Annotated[str, typer.Option("--timezone", help="As in Europe/Stockholm.")] = "UTC",
+    never: Annotated[bool, typer.Option("--never", help="Sleep only when told to.")] = False,
+    url: options.Url = options.DEFAULT_URL,
+    token: options.Token = None,
+    data: options.Data = None,
+    json: options.Json = False,
+) -> None:
+    """Let workers of a name take no tasks at some times of the day."""
+    if never == (begins is not None and ends is not None):
+        raise InputError("either a span or none is wanted", where="--from", remedy="Give --from and --to, or --never.")
+    wanted = None if never else _schedule(days, begins, ends, timezone)
+    with options.connect(url, token, data) as api:
+        api.set_schedule(name, wanted)
+    if json:
+        print_json({"worker": name, "schedule": wanted.model_dump(mode="json") if wanted else None})
+    elif wanted is None:
+        results.print(f"{name}: sleeps only when told to", markup=False)
+    else:
+        span = f"{wanted.begins:%H:%M} to {wanted.ends:%H:%M} {wanted.timezone}"
+        results.print(f"{name}: sleeps {','.join(wanted.days)} from {span}", markup=False)
+
+
+def _schedule(days: str | None, begins: str | None, ends: str | None, timezone: str) -> SleepSchedule:
+    """InputError where it is none."""
+    first, dash, last = (days or "mon-sun").lower().partition("-")
+    if dash and first in DAYS and last in DAYS:
+        start, stop = DAYS.index(first), DAYS.index(last)
+        chosen = [DAYS[day % 7] for day in range(start, stop + 1 if stop >= start else stop + 8)]
+    else:
+        chosen = [day.strip() for day in (days or "").lower().split(",")]
+    try:
+        return SleepSchedule.model_validate({"days": chosen, "begins": begins, "ends": ends, "timezone": timezone})
+    except ValidationError as error:
+        first_error = error.errors()[0]
+        option = {"days": "--days", "begins": "--from", "ends": "--to"}.get(str(first_error["loc"][0]), "--timezone")
+        raise InputError(
+            f"'{first_error.get('input')}' is refused: {first_error['msg']}",
+            where=option,
+            remedy="As in --days mon-fri --from 08:00 --to 18:00 --timezone Europe/Stockholm.",
+        ) from None
 
 
 def _named(api: Client, name: str) -> list[WorkerView]:

@@ -8,11 +8,13 @@ import typer
 
 from kiln_schemas.client import Client
 from kiln_schemas.errors import AuthError
+from kiln_schemas.logs import LogFormat
 
 DEFAULT_URL: Final = "http://127.0.0.1:8321"
 TOKEN_FILE: Final = "token"
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+LogLines = Annotated[LogFormat, typer.Option("--log-format", help="The log on standard error: text, or JSON lines.")]
 Url = Annotated[str, typer.Option("--url", envvar="LIGHTKILN_URL", help="The coordinator.")]
 Token = Annotated[
     str | None,
@@ -54,6 +56,10 @@ JobPriority = Annotated[
 ]
 Label = Annotated[
     list[str] | None, typer.Option("--label", metavar="KEY=VALUE", help="To find jobs by; may be repeated.")
+]
+Tag = Annotated[
+    list[str] | None,
+    typer.Option("--tag", metavar="TAG", help="Only workers with this tag do its tasks; may be repeated."),
 ]
 Environment = Annotated[
     Path | None, typer.Option("--env", metavar="FILE", help="Distant light: an equirectangular HDR or EXR.")

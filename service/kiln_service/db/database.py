@@ -1,8 +1,7 @@
 """Connections and transactions.
 
 A `Tx` runs named queries inside one transaction. The order in which rows are locked is the same everywhere,
-so transactions do not deadlock: a waiting row of the queue (claim only, never waited for) > the job >
-its tasks > the queue's rows of tasks that run.
+so transactions do not deadlock: the worker that asks > the job > its tasks.
 """
 
 from collections.abc import AsyncIterator

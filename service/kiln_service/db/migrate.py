@@ -1,17 +1,15 @@
 """Bring the database to the schema of this version, once, however many coordinators start together.
 
 The migrations are the files `migrations/NNNN_*.sql`, applied in order in one transaction under an advisory
-lock; procrastinate's schema is applied as it ships. A database that a newer version migrated is refused.
+lock. A database that a newer version migrated is refused.
 """
 
 import hashlib
 from importlib import resources
 from typing import Final
 
-from procrastinate.schema import SchemaManager
-
 from kiln_schemas.errors import Conflict
-from kiln_service.db.database import Database, Tx
+from kiln_service.db.database import Database
 
 MIGRATION_LOCK: Final = 0x6B696C6E_0001
 """Advisory lock number: "kiln", 1."""
@@ -37,7 +35,6 @@ async def migrate(database: Database) -> list[str]:
                 where="database",
                 remedy="Run the newer lightkiln that migrated it.",
             )
-        await _apply_queue_schema(tx)
         applied = []
         for version, name, text in known:
             digest = hashlib.sha256(text.encode()).hexdigest()
@@ -52,10 +49,3 @@ async def migrate(database: Database) -> list[str]:
                     remedy="Use the lightkiln version that made the database, or a new database.",
                 )
         return applied
-
-
-async def _apply_queue_schema(tx: Tx) -> None:
-    """Make procrastinate's tables where they are missing."""
-    if (await tx.one("has_queue_schema"))["present"]:
-        return
-    await tx.connection.execute(SchemaManager.get_schema())

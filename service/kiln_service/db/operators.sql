@@ -34,9 +34,15 @@ SELECT * FROM audit WHERE (%(before)s::bigint IS NULL OR id < %(before)s) ORDER 
 
 -- name: list_workers
 -- Workers that were seen of late, with the task that each has.
-SELECT workers.*, workers.seen < now() - make_interval(secs => %(offline_s)s) AS offline,
-       tasks.id AS task_id, tasks.job_id, tasks.kind, tasks.label
+SELECT workers.*, workers.seen < now() - make_interval(secs => %(offline_s)s) AS offline, now() AS now,
+       tasks.id AS task_id, tasks.job_id, tasks.kind, tasks.label,
+       schedules.days, schedules.begins, schedules.ends, schedules.timezone,
+       COALESCE((
+           SELECT jsonb_agg(jsonb_build_object('job_id', job_id, 'kind', kind, 'until', until) ORDER BY until DESC)
+           FROM blocks WHERE blocks.worker = workers.name AND until > now()
+       ), '[]') AS blocks
 FROM workers
+LEFT JOIN schedules ON schedules.worker = workers.name
 LEFT JOIN LATERAL (
     SELECT id, job_id, kind, label FROM tasks
     WHERE tasks.worker_id = workers.id AND tasks.state = 'active' ORDER BY started DESC LIMIT 1
@@ -48,6 +54,25 @@ ORDER BY workers.name, workers.registered;
 -- Tell a worker what to do from its next claim on.
 UPDATE workers SET orders = %(orders)s WHERE id = %(id)s RETURNING id, name;
 
+-- name: delete_blocks
+-- A worker may take tasks of all jobs again.
+DELETE FROM blocks WHERE worker = %(worker)s;
+
+-- name: find_schedule
+-- When workers of a name sleep, and what time it is.
+SELECT *, now() AS now FROM schedules WHERE worker = %(worker)s;
+
+-- name: put_schedule
+-- Let workers of a name sleep by a schedule.
+INSERT INTO schedules (worker, days, begins, ends, timezone)
+VALUES (%(worker)s, %(days)s, %(begins)s, %(ends)s, %(timezone)s)
+ON CONFLICT (worker) DO UPDATE
+SET days = EXCLUDED.days, begins = EXCLUDED.begins, ends = EXCLUDED.ends, timezone = EXCLUDED.timezone;
+
+-- name: delete_schedule
+-- Workers of a name have no schedule.
+DELETE FROM schedules WHERE worker = %(worker)s;
+
 -- name: count_tasks
 -- Tasks by kind and state.
 SELECT kind, state, count(*) AS tasks FROM tasks GROUP BY kind, state;
@@ -56,12 +81,26 @@ SELECT kind, state, count(*) AS tasks FROM tasks GROUP BY kind, state;
 -- Jobs by state.
 SELECT state, count(*) AS jobs FROM jobs GROUP BY state;
 
--- name: sum_seconds
--- Busy seconds and number of completed attempts by kind.
-SELECT kind, count(*) AS tasks, COALESCE(sum((result ->> 'seconds')::float8), 0) AS seconds,
-       COALESCE(sum((result ->> 'paths')::float8), 0) AS paths,
+-- name: sum_work
+-- Completed attempts by kind, and what tiles rendered.
+SELECT kind, count(*) AS tasks, COALESCE(sum((result ->> 'paths')::float8), 0) AS paths,
        COALESCE(sum((spec -> 'tile' ->> 'texels')::float8), 0) AS texels
 FROM tasks WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind;
+
+-- name: seconds_of_tasks
+-- Completed attempts by kind and by the number of the bounds, in seconds, that each took longer than.
+SELECT kind, width_bucket((result ->> 'seconds')::float8, %(bounds)s::float8[]) AS bucket, count(*) AS tasks,
+       sum((result ->> 'seconds')::float8) AS seconds
+FROM tasks WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind, bucket;
+
+-- name: sum_light_fields
+-- Bytes of radiance (three halves a pixel) in stores that are not freed, each counted once.
+SELECT COALESCE(sum((tasks.spec -> 'tile' ->> 'texels')::bigint * readers.pixels * 6), 0)::bigint AS bytes
+FROM (
+    SELECT DISTINCT ON (store_url) id, ((settings -> 'render' ->> 'image_size')::bigint) ^ 2 AS pixels
+    FROM jobs WHERE freed IS NULL ORDER BY store_url, id
+) AS readers
+JOIN tasks ON tasks.job_id = readers.id AND tasks.kind = 'render' AND tasks.state = 'completed';
 
 -- name: count_events
 -- Events of tasks by kind.

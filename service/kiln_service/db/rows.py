@@ -44,6 +44,7 @@ class JobRow(_Row):
     store_url: str
     priority: int
     labels: dict[str, str]
+    tags: tuple[str, ...]
     submitter: str | None
     renders_of: str | None
     notes: tuple[str, ...]
@@ -66,6 +67,7 @@ class JobRow(_Row):
                 "cameras": {name: Camera.model_validate(tree) for name, tree in values["cameras"].items()},
                 "gate_results": tuple(GateResult.model_validate(tree) for tree in values["gate_results"]),
                 "notes": tuple(values["notes"]),
+                "tags": tuple(values["tags"]),
                 "error": values["error"] and Problem.model_validate(values["error"]),
             }
         )
@@ -88,7 +90,6 @@ class TaskRow(_Row):
     worker_id: str | None
     checkpoint: str | None
     error: Problem | None
-    queue_job: int | None
     created: datetime
     started: datetime | None
     finished: datetime | None
@@ -115,7 +116,7 @@ class WorkerRow(_Row):
     id: str
     name: str
     kinds: tuple[str, ...]
-    queue_worker: int
+    tags: tuple[str, ...]
     orders: str
     """`work`, `sleep` or `drain`."""
 
@@ -123,4 +124,4 @@ class WorkerRow(_Row):
     def of(cls, row: DictRow) -> Self:
         """Parse what psycopg returned."""
         values = cls._picked(row)
-        return cls(**values | {"kinds": tuple(values["kinds"])})
+        return cls(**values | {"kinds": tuple(values["kinds"]), "tags": tuple(values["tags"])})

@@ -21,10 +21,6 @@ SELECT version, sha256 FROM kiln_migrations;
 -- Remember an applied migration.
 INSERT INTO kiln_migrations (version, name, sha256) VALUES (%(version)s, %(name)s, %(sha256)s);
 
--- name: has_queue_schema
--- Whether procrastinate's tables are there.
-SELECT to_regclass('procrastinate_jobs') IS NOT NULL AS present;
-
 -- name: ping
 -- Whether the database answers and is migrated.
 SELECT count(*) AS migrations FROM kiln_migrations;

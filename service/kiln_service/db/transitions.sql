@@ -3,21 +3,21 @@
 -- name: insert_job
 -- A new job.
 INSERT INTO jobs (
-    id, name, method, state, settings, bundle, gates, cameras, store_url, priority, labels, submitter,
+    id, name, method, state, settings, bundle, gates, cameras, store_url, priority, labels, tags, submitter,
     idempotency_key, request_sha256
 ) VALUES (
     %(id)s, %(name)s, %(method)s, 'queued', %(settings)s, %(bundle)s, %(gates)s, %(cameras)s, %(store_url)s,
-    %(priority)s, %(labels)s, %(submitter)s, %(idempotency_key)s, %(request_sha256)s
+    %(priority)s, %(labels)s, %(tags)s, %(submitter)s, %(idempotency_key)s, %(request_sha256)s
 )
 RETURNING *;
 
 -- name: insert_tasks
 -- New tasks of a job, given as a JSON array; ordinals continue after those that are there.
-INSERT INTO tasks (id, job_id, ordinal, kind, label, state, spec)
+INSERT INTO tasks (id, job_id, ordinal, kind, label, state, rank, spec)
 SELECT planned.id, %(job_id)s, planned.place + (SELECT count(*) FROM tasks WHERE job_id = %(job_id)s),
-       planned.kind, planned.label, planned.state, planned.spec
+       planned.kind, planned.label, planned.state, planned.rank, planned.spec
 FROM jsonb_to_recordset(%(tasks)s)
-    AS planned (id text, place integer, kind text, label text, state text, spec jsonb);
+    AS planned (id text, place integer, kind text, label text, state text, rank integer, spec jsonb);
 
 -- name: move_job
 -- Move a job, with the times and the error that belong to the move.
@@ -28,12 +28,13 @@ SET state = %(after)s,
     finished = CASE WHEN %(after)s::text = 'queued' THEN NULL WHEN %(final)s THEN COALESCE(finished, now()) ELSE finished END
 WHERE id = %(id)s AND state = %(before)s;
 
--- name: move_task_queued
--- waiting > queued.
-UPDATE tasks SET state = 'queued' WHERE id = %(id)s AND state = %(before)s;
+-- name: release_tasks
+-- waiting > queued: all tasks of a kind of a job.
+UPDATE tasks SET state = 'queued' WHERE job_id = %(job_id)s AND kind = %(kind)s AND state = %(before)s
+RETURNING id;
 
 -- name: move_task_active
--- queued > active: a new attempt begins.
+-- queued, soft-failed > active: a new attempt begins.
 UPDATE tasks
 SET state = 'active', attempt = attempt + 1, worker_id = %(worker_id)s, progress = NULL,
     started = now(), heartbeat = now()
@@ -41,9 +42,9 @@ WHERE id = %(id)s AND state = %(before)s
 RETURNING *;
 
 -- name: move_task_requeued
--- active > queued: the attempt ended without a result.
+-- active > queued, soft-failed: the attempt ended without a result.
 UPDATE tasks
-SET state = 'queued', worker_id = NULL, progress = NULL, started = NULL, heartbeat = NULL,
+SET state = %(after)s, worker_id = NULL, progress = NULL, started = NULL, heartbeat = NULL,
     strikes = strikes + %(strikes)s
 WHERE id = %(id)s AND state = %(before)s;
 
@@ -60,20 +61,50 @@ SET state = %(after)s, error = %(error)s, finished = now(), heartbeat = NULL
 WHERE id = %(id)s AND state = %(before)s;
 
 -- name: cancel_idle_tasks
--- waiting, queued > canceled: all tasks of a job that no worker has.
+-- waiting, queued, soft-failed > canceled: all tasks of a job that no worker has.
 UPDATE tasks
 SET state = 'canceled', finished = now()
 WHERE job_id = %(job_id)s AND state = ANY(%(before)s)
-RETURNING id, queue_job, checkpoint;
+RETURNING id, checkpoint;
 
 -- name: reopen_tasks
 -- failed, canceled > queued in the stage that the job has come to, > waiting in later ones.
 UPDATE tasks
 SET state = CASE WHEN kind = %(stage)s THEN 'queued' ELSE 'waiting' END,
-    strikes = 0, error = NULL, progress = NULL, worker_id = NULL, checkpoint = NULL, queue_job = NULL,
+    strikes = 0, error = NULL, progress = NULL, worker_id = NULL, checkpoint = NULL,
     started = NULL, finished = NULL, heartbeat = NULL
 WHERE job_id = %(job_id)s AND state = ANY(%(before)s)
-RETURNING id, kind, state;
+RETURNING id;
+
+-- name: redo_tasks
+-- > queued, waiting: tasks of a job are to be done again, whatever became of them.
+UPDATE tasks
+SET state = %(after)s, result = NULL,
+    strikes = 0, error = NULL, progress = NULL, worker_id = NULL, checkpoint = NULL,
+    started = NULL, finished = NULL, heartbeat = NULL
+WHERE job_id = %(job_id)s AND id = ANY(%(ids)s) AND state = ANY(%(before)s)
+RETURNING id;
+
+-- name: forgive_tasks
+-- failed, soft-failed > queued where nobody else failed them often enough: a worker's failures count no more.
+WITH forgiven AS (
+    SELECT task_id, count(*) AS times FROM failures JOIN tasks ON tasks.id = failures.task_id
+    WHERE failures.worker = %(worker)s AND tasks.job_id = %(job_id)s AND tasks.kind = %(kind)s
+    GROUP BY task_id
+), counted AS (
+    SELECT task_id, times, (SELECT count(*) FROM failures WHERE failures.task_id = forgiven.task_id) AS of_all
+    FROM forgiven
+)
+UPDATE tasks
+SET error = NULL, worker_id = NULL, progress = NULL,
+    started = NULL, finished = NULL, heartbeat = NULL,
+    state = CASE
+        WHEN tasks.state = 'soft-failed' AND counted.of_all > counted.times THEN 'soft-failed' ELSE 'queued'
+    END
+FROM counted
+WHERE tasks.id = counted.task_id
+  AND (tasks.state = 'soft-failed' OR (tasks.state = 'failed' AND counted.of_all >= %(max_attempts)s))
+RETURNING tasks.id;
 
 -- name: reuse_results
 -- waiting > completed: tasks of a kind whose results another job has under the same labels.

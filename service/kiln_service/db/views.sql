@@ -25,6 +25,7 @@ SELECT job_id, kind,
        count(*) FILTER (WHERE state = 'completed') AS completed,
        count(*) FILTER (WHERE state = 'active') AS active,
        count(*) FILTER (WHERE state = 'failed') AS failed,
+       count(*) FILTER (WHERE state = 'soft-failed') AS soft_failed,
        COALESCE(sum(extract(epoch FROM finished - started)) FILTER (WHERE state = 'completed'), 0)::float8 AS seconds,
        array_agg(LEAST(COALESCE((progress ->> 'done')::float8 / (progress ->> 'total')::float8, 0), 1)
            ORDER BY ordinal) FILTER (WHERE state = 'active') AS fractions,
@@ -43,8 +44,8 @@ WHERE job_id = %(job_id)s
 ORDER BY ordinal;
 
 -- name: find_task
--- Whether a task is there.
-SELECT id FROM tasks WHERE id = %(id)s;
+-- A task's state.
+SELECT id, state FROM tasks WHERE id = %(id)s;
 
 -- name: read_events
 -- A job's history after an event.

@@ -12,13 +12,119 @@ SELECT * FROM tasks WHERE id = %(id)s FOR UPDATE;
 -- Which job to lock before a task.
 SELECT job_id FROM tasks WHERE id = %(id)s;
 
--- name: tasks_in_state
--- Tasks of a kind in a state, in the order of planning.
-SELECT * FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state = %(state)s ORDER BY ordinal FOR UPDATE;
+-- name: has_unfinished
+-- Whether tasks of a kind have not completed.
+SELECT EXISTS (
+    SELECT FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state <> 'completed'
+) AS unfinished;
 
--- name: count_unfinished
--- Tasks of a kind that have not completed.
-SELECT count(*) AS tasks FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state <> 'completed';
+-- name: tasks_of_kinds
+-- Tasks of some kinds of a job, in the order of planning.
+SELECT id, kind, label, state, spec FROM tasks WHERE job_id = %(job_id)s AND kind = ANY(%(kinds)s) ORDER BY ordinal;
+
+-- name: failed_share
+-- Of a job's tasks of a kind: how many there are, how many failed; and whether any of the job can still be worked on.
+SELECT count(*) FILTER (WHERE kind = %(kind)s) AS total,
+       count(*) FILTER (WHERE kind = %(kind)s AND state = 'failed') AS failed,
+       count(*) FILTER (WHERE state IN ('queued', 'soft-failed', 'active')) AS open
+FROM tasks WHERE job_id = %(job_id)s;
+
+-- name: stuck_on
+-- The error of the first failed task of a job of which nothing can be worked on.
+SELECT error FROM tasks
+WHERE job_id = %(job_id)s AND state = 'failed'
+  AND NOT EXISTS (
+      SELECT FROM tasks AS other
+      WHERE other.job_id = %(job_id)s AND other.state IN ('queued', 'soft-failed', 'active')
+  )
+ORDER BY finished LIMIT 1;
+
+-- name: pick_task
+-- The task that a worker gets next, of all jobs or of one: of those that are queued, of its kinds, of jobs that go on
+-- and whose tags it has. Not of a job that it is blocked for, nor one that it has failed while another worker is there
+-- that has not.
+SELECT tasks.id, tasks.job_id FROM tasks JOIN jobs ON jobs.id = tasks.job_id
+WHERE tasks.state IN ('queued', 'soft-failed') AND tasks.kind = ANY(%(kinds)s)
+  AND tasks.job_id = COALESCE(%(job_id)s, tasks.job_id)
+  AND jobs.state IN ('queued', 'active') AND jobs.tags <@ %(tags)s
+  AND NOT EXISTS (
+      SELECT FROM blocks
+      WHERE worker = %(worker)s AND blocks.job_id = tasks.job_id AND blocks.kind = tasks.kind AND until > now()
+  )
+  AND (
+      tasks.state = 'queued'
+      OR NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = %(worker)s)
+      OR NOT EXISTS (
+          SELECT FROM workers AS other
+          WHERE other.name <> %(worker)s AND other.seen > now() - make_interval(secs => %(stale_s)s)
+            AND other.orders = 'work' AND tasks.kind = ANY(other.kinds) AND jobs.tags <@ other.tags
+            AND NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = other.name)
+            AND NOT EXISTS (
+                SELECT FROM blocks
+                WHERE worker = other.name AND blocks.job_id = tasks.job_id AND blocks.kind = tasks.kind AND until > now()
+            )
+      )
+  )
+ORDER BY tasks.rank DESC, tasks.job_id, tasks.ordinal
+LIMIT 1;
+
+-- name: rank_tasks
+-- A job's place in the queue: its priority times %(step)s plus what a task's stage adds.
+UPDATE tasks SET rank = %(priority)s * %(step)s + rank %% %(step)s WHERE job_id = %(job_id)s;
+
+-- name: add_failure
+-- An attempt of a task ended badly on a worker; how many tasks of this kind of the job that worker has failed, and
+-- whether another one is there that could go on.
+WITH added AS (
+    INSERT INTO failures (task_id, attempt, worker) VALUES (%(task_id)s, %(attempt)s, %(worker)s)
+    ON CONFLICT DO NOTHING
+), struck AS (
+    UPDATE workers SET strikes = strikes + 1 WHERE id = %(worker_id)s
+)
+SELECT (
+    SELECT count(DISTINCT id) FROM (
+        SELECT %(task_id)s AS id
+        UNION SELECT tasks.id FROM failures JOIN tasks ON tasks.id = failures.task_id
+        WHERE failures.worker = %(worker)s AND tasks.job_id = jobs.id AND tasks.kind = %(kind)s
+    ) AS failed
+) AS tasks, EXISTS (
+    SELECT FROM workers AS other
+    WHERE other.name <> %(worker)s AND other.seen > now() - make_interval(secs => %(stale_s)s)
+      AND other.orders = 'work' AND %(kind)s = ANY(other.kinds) AND jobs.tags <@ other.tags
+      AND NOT EXISTS (
+          SELECT FROM blocks
+          WHERE worker = other.name AND blocks.job_id = jobs.id AND blocks.kind = %(kind)s AND until > now()
+      )
+) AS others
+FROM jobs WHERE jobs.id = %(job_id)s;
+
+-- name: add_block
+-- A worker gets no more tasks of a kind of a job for a while.
+INSERT INTO blocks (worker, job_id, kind, until)
+VALUES (%(worker)s, %(job_id)s, %(kind)s, now() + make_interval(secs => %(seconds)s))
+ON CONFLICT (worker, job_id, kind) DO UPDATE SET until = EXCLUDED.until;
+
+-- name: forget_worker_failures
+-- What a worker failed of a kind of a job counts no more.
+DELETE FROM failures USING tasks
+WHERE tasks.id = failures.task_id AND failures.worker = %(worker)s AND tasks.job_id = %(job_id)s AND tasks.kind = %(kind)s;
+
+-- name: recount_strikes
+-- What counts of a job's tasks of a kind after a worker's failures were forgotten.
+UPDATE tasks SET strikes = (SELECT count(*) FROM failures WHERE task_id = tasks.id)
+WHERE job_id = %(job_id)s AND kind = %(kind)s AND strikes > 0;
+
+-- name: forget_task_failures
+-- What was failed of tasks counts no more.
+DELETE FROM failures WHERE task_id = ANY(%(ids)s);
+
+-- name: clear_strikes
+-- A worker has done something well.
+UPDATE workers SET strikes = 0 WHERE id = %(id)s AND strikes > 0;
+
+-- name: delete_artifacts
+-- What a job published is no longer its own.
+DELETE FROM artifacts WHERE job_id = %(job_id)s;
 
 -- name: count_active
 -- Tasks of a job that workers have.
@@ -44,13 +150,6 @@ SELECT result ->> 'scene' AS scene, result ->> 'texel_map' AS texel_map,
        coalesce(result -> 'between', '[]') AS between
 FROM tasks WHERE job_id = %(job_id)s AND kind = 'prepare' AND state = 'completed';
 
--- name: task_deferred
--- Remember the queue jobs that carry tasks.
-UPDATE tasks
-SET queue_job = queue.id
-FROM procrastinate_jobs AS queue
-WHERE queue.id = ANY(%(queue_jobs)s) AND tasks.id = queue.args ->> 'task_id';
-
 -- name: notify_queued
 -- Wake the claims that wait.
 SELECT pg_notify('kiln_queued', %(kinds)s);
@@ -69,12 +168,16 @@ SELECT pg_notify('kiln_event', job_id) FROM added;
 
 -- name: insert_worker
 -- A worker that registered.
-INSERT INTO workers (id, name, kinds, memory_bytes, threads, device, version, queue_worker)
-VALUES (%(id)s, %(name)s, %(kinds)s, %(memory_bytes)s, %(threads)s, %(device)s, %(version)s, %(queue_worker)s);
+INSERT INTO workers (id, name, kinds, memory_bytes, threads, device, version, tags)
+VALUES (%(id)s, %(name)s, %(kinds)s, %(memory_bytes)s, %(threads)s, %(device)s, %(version)s, %(tags)s);
+
+-- name: find_worker
+-- A registered worker.
+SELECT * FROM workers WHERE id = %(id)s;
 
 -- name: see_worker
--- A registered worker, seen now.
-UPDATE workers SET seen = now() WHERE id = %(id)s RETURNING *;
+-- A worker was seen now; to the second is enough.
+UPDATE workers SET seen = now() WHERE id = %(id)s AND seen < now() - interval '1 second';
 
 -- name: beat_task
 -- Keep an attempt alive; no row where the attempt is not the task's current one.
@@ -99,8 +202,8 @@ INSERT INTO task_logs (task_id, attempt, lines)
 SELECT id, %(attempt)s, %(lines)s FROM tasks WHERE id = %(task_id)s;
 
 -- name: task_log
--- All lines of a task, oldest first.
-SELECT attempt, lines FROM task_logs WHERE task_id = %(task_id)s ORDER BY id;
+-- Lines of a task after those read before, oldest first.
+SELECT id, attempt, lines FROM task_logs WHERE task_id = %(task_id)s AND id > %(after)s ORDER BY id;
 
 -- name: last_log
 -- The last pieces of a task's log, newest first.
@@ -110,17 +213,6 @@ SELECT lines FROM task_logs WHERE task_id = %(task_id)s ORDER BY id DESC LIMIT 2
 -- Publish an attempt's checkpoint: progress was made, so earlier failures count no more.
 UPDATE tasks SET checkpoint = %(sha256)s, strikes = 0, heartbeat = now() WHERE id = %(id)s;
 
--- name: queued_queue_jobs
--- The queue jobs of a job's tasks that no worker has.
-SELECT queue_job FROM tasks WHERE job_id = %(job_id)s AND state = 'queued' AND queue_job IS NOT NULL;
-
--- name: queued_outside_of_queue
--- A job's queued tasks that nothing in the queue will bring to a worker.
-SELECT tasks.id, tasks.kind FROM tasks
-LEFT JOIN procrastinate_jobs AS queue ON queue.id = tasks.queue_job AND queue.status = 'todo'
-WHERE tasks.job_id = %(job_id)s AND tasks.state = 'queued' AND queue.id IS NULL
-ORDER BY tasks.ordinal;
-
 -- name: unfinished_kinds
 -- Kinds of a job's tasks that have not all completed.
 SELECT DISTINCT kind FROM tasks WHERE job_id = %(job_id)s AND state <> 'completed';
@@ -128,15 +220,9 @@ SELECT DISTINCT kind FROM tasks WHERE job_id = %(job_id)s AND state <> 'complete
 -- name: change_job
 -- Rank or label a job anew; NULL keeps what there is.
 UPDATE jobs
-SET priority = COALESCE(%(priority)s, priority), labels = COALESCE(%(labels)s, labels)
+SET priority = COALESCE(%(priority)s, priority), labels = COALESCE(%(labels)s, labels),
+    tags = COALESCE(%(tags)s::text[], tags)
 WHERE id = %(id)s;
-
--- name: rank_queue_jobs
--- The same in the queue, for tasks that wait there; the queue's priority is the job's times %(step)s plus its kind's.
-UPDATE procrastinate_jobs AS queue
-SET priority = %(priority)s * %(step)s + queue.priority - (queue.priority / %(step)s) * %(step)s
-FROM tasks
-WHERE tasks.job_id = %(job_id)s AND queue.id = tasks.queue_job AND queue.status = 'todo';
 
 -- name: lock_idempotency_key
 -- Let one of several identical submissions in at a time; held until the transaction ends.
@@ -191,22 +277,3 @@ ORDER BY heartbeat;
 -- Whether that is still so, now that the task is locked.
 SELECT heartbeat < now() - make_interval(secs => %(seconds)s) AS stale FROM tasks WHERE id = %(id)s;
 
--- name: queued_without_queue_job
--- Queued tasks of jobs that are not paused, which nothing in the queue will bring to a worker.
-SELECT tasks.id, tasks.job_id FROM tasks
-JOIN jobs ON jobs.id = tasks.job_id AND jobs.state <> 'paused'
-LEFT JOIN procrastinate_jobs AS queue ON queue.id = tasks.queue_job AND queue.status = 'todo'
-WHERE tasks.state = 'queued' AND queue.id IS NULL;
-
--- name: has_queue_job
--- Whether a queue job waits for this task, now that the task is locked.
-SELECT EXISTS (
-    SELECT FROM procrastinate_jobs AS queue
-    WHERE queue.id = %(queue_job)s AND queue.status = 'todo'
-) AS present;
-
--- name: queue_jobs_without_task
--- Queue jobs that wait for a task which is not queued.
-SELECT queue.id FROM procrastinate_jobs AS queue
-LEFT JOIN tasks ON tasks.queue_job = queue.id AND tasks.state = 'queued'
-WHERE queue.status = 'todo' AND queue.task_name = %(task_name)s AND tasks.id IS NULL;

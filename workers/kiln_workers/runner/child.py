@@ -13,6 +13,7 @@ import queue
 import secrets
 import shutil
 import sys
+import tempfile
 import threading
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,7 +24,7 @@ from kiln_schemas.tasks import Claim, Progress, Result, TaskKind
 from kiln_workers.runner.blobs import BlobCache
 from kiln_workers.runner.client import CoordinatorClient
 from kiln_workers.runner.context import TaskContext
-from kiln_workers.runner.protocol import Done, Failed, Ready, Report, Setup, Stop, ToChild, Work, encode
+from kiln_workers.runner.protocol import END_OF_LOG, Done, Failed, Ready, Report, Setup, Stop, ToChild, Work, encode
 from kiln_workers.runner.tether import die_with_parent
 
 log = logging.getLogger(__name__)
@@ -46,7 +47,9 @@ class Child:
         self._say(ready(self._setup))
         while True:
             claim = self._work.get()
-            self._say(self._run(claim))
+            outcome = self._run(claim)
+            print(END_OF_LOG, file=sys.stderr, flush=True)
+            self._say(outcome)
 
     def _listen(self, requests: BinaryIO) -> None:
         """Take the parent's lines while a task runs; the end of them is the end of this process."""
@@ -66,6 +69,7 @@ class Child:
         try:
             shutil.rmtree(scratch, ignore_errors=True)
             scratch.mkdir(parents=True)
+            tempfile.tempdir = str(scratch)  # what libraries write beside goes with it
             return Done(result=self._call_stage(claim, scratch))
         except KilnError as error:
             return Failed(problem=error.problem(), retryable=error.retryable)

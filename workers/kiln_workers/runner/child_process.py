@@ -15,7 +15,7 @@ from typing import IO, Final
 from pydantic import ValidationError
 
 from kiln_schemas.base import Contract
-from kiln_workers.runner.protocol import Done, Failed, Ready, Report, Setup, ToParent, encode
+from kiln_workers.runner.protocol import END_OF_LOG, Done, Failed, Ready, Report, Setup, ToParent, Work, encode
 
 READER_JOIN_S: Final = 2.0
 LOG_LINES: Final = 200
@@ -54,6 +54,7 @@ class ChildProcess:
         self.answers: queue.Queue[Answer] = queue.Queue()
         self.tail: deque[str] = deque(maxlen=LOG_LINES)
         self._on_line = on_line
+        self._told_all = threading.Event()
         self._process = subprocess.Popen(
             [sys.executable, "-m", "kiln_workers.runner.child", str(os.getpid())],
             stdin=subprocess.PIPE,
@@ -88,6 +89,16 @@ class ChildProcess:
         except BrokenPipeError:
             self.kill()
 
+    def begin(self, work: Work) -> None:
+        """Send a task; what the tasks before it printed is theirs."""
+        self.tail.clear()
+        self._told_all.clear()
+        self.send(work)
+
+    def hear_out(self) -> None:
+        """Wait for the last line that the task printed: it comes by another pipe than the task's outcome."""
+        self._told_all.wait(READER_JOIN_S)
+
     def kill(self) -> None:
         """End the child and all that it started, and wait until it is gone."""
         with suppress(ProcessLookupError):
@@ -104,6 +115,9 @@ class ChildProcess:
         with pipe:
             for raw in pipe:
                 line = raw.decode(errors="replace").rstrip()
+                if line == END_OF_LOG:
+                    self._told_all.set()
+                    continue
                 self.tail.append(line)
                 self._on_line(line)
 

@@ -19,7 +19,7 @@ from typing import Final, Self
 import httpx
 
 from kiln_schemas.base import Contract
-from kiln_schemas.errors import Unreachable, error_of_answer
+from kiln_schemas.errors import TooMany, Unreachable, error_of_answer, wait_asked
 from kiln_schemas.job import MissingReply
 from kiln_schemas.tasks import (
     Checkpoint,
@@ -38,7 +38,7 @@ PAUSE_S: Final = (0.1, 5.0)
 """First and longest pause between two tries."""
 DEFECT_PATIENCE_S: Final = 60.0
 """A coordinator that answers 500 is asked again for so long: it may be losing its database for a moment."""
-AWAY: Final = frozenset({502, 503, 504})
+AWAY: Final = frozenset({TooMany.status, 502, 503, 504})
 """Statuses of a coordinator, or of a proxy before it, that will be back."""
 
 
@@ -158,7 +158,7 @@ class CoordinatorClient:
         patience = self._patience_s if patience_s is None else patience_s
         began, pause = time.monotonic(), PAUSE_S[0]
         while True:
-            bound = patience
+            bound, asked_s = patience, 0.0
             try:
                 response = attempt()
             except httpx.TransportError as error:
@@ -171,6 +171,7 @@ class CoordinatorClient:
                     raise error_of_answer(response.content, response.status_code, asked, self.url)
                 reason = f"it answers {response.status_code}"
                 bound = patience if response.status_code in AWAY else min(patience, DEFECT_PATIENCE_S)
+                asked_s = wait_asked(response.headers.get("retry-after"))
             if time.monotonic() - began >= bound or self._stop.is_set():
                 raise Unreachable(
                     f"the coordinator does not answer ({reason})",
@@ -180,7 +181,7 @@ class CoordinatorClient:
             if pause == PAUSE_S[0]:
                 self._on_wait(f"the coordinator at {self.url} does not answer ({reason}); trying again")
             # Up to a half of random extra keeps a farm from returning in step.
-            self._stop.wait(pause * random.uniform(1.0, 1.5))
+            self._stop.wait(max(pause, asked_s) * random.uniform(1.0, 1.5))
             pause = min(2 * pause, PAUSE_S[1])
 
 

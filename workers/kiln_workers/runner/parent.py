@@ -75,6 +75,7 @@ class WorkerOptions:
     threads: int
     folder: Path
     """For temporary files and the blob cache; nobody else uses it."""
+    tags: tuple[str, ...] = ()
     cache_bytes: int = 8 << 30
     stages: str = "kiln_workers.stages"
 
@@ -127,7 +128,7 @@ class Worker:
         self._current = claim
         self._lines.take()
         self._announce("task.claimed", _names(claim))
-        child.send(Work(claim=claim))
+        child.begin(Work(claim=claim))
         self._settle(claim, self._attend(child, claim, welcome))
         self._current = None
 
@@ -137,6 +138,7 @@ class Worker:
             WorkerRegistration(
                 name=options.name,
                 kinds=options.kinds,
+                tags=options.tags,
                 memory_bytes=options.memory_bytes,
                 threads=options.threads,
                 device=self._device,
@@ -203,7 +205,10 @@ class Worker:
             match answer:
                 case Report(progress=progress):
                     news = True
-                case Done() | Failed() | Ended():
+                case Done() | Failed():
+                    child.hear_out()
+                    return answer
+                case Ended():
                     return answer
                 case Ready():
                     raise InternalError("the child said it is ready twice")
@@ -279,7 +284,8 @@ class Worker:
 
     def _hear_line(self, line: str) -> None:
         self._lines.add(line)
-        self._announce("log", {"line": line})
+        current = self._current
+        self._announce("log", {"line": line} | (_names(current) if current else {}))
 
     def _interrupt(self, signum: int, frame: FrameType | None) -> None:
         if not self._closing:

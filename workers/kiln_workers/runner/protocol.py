@@ -14,6 +14,9 @@ from kiln_schemas.base import Contract
 from kiln_schemas.errors import Problem
 from kiln_schemas.tasks import Claim, Progress, Result, TaskKind
 
+END_OF_LOG: Final = "\x1e end of the task's log"
+"""The child's last line on standard error of every task."""
+
 
 class Setup(Contract):
     """Parent to child, first line: everything that stays the same between tasks."""

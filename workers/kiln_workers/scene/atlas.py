@@ -19,6 +19,7 @@ import numpy.typing as npt
 from kiln_schemas.errors import InputError
 from kiln_schemas.settings import LightmapSettings, UvPolicy
 from kiln_workers.scene.geometry import Floats, Ints, face_areas
+from kiln_workers.scene.limits import MAX_COVERAGE
 from kiln_workers.scene.model import Mesh, Scene
 from kiln_workers.scene.packing import Chart, bounding_turn, pack_charts
 from kiln_workers.scene.raster import interior_samples
@@ -83,6 +84,10 @@ def _own_fault(mesh: Mesh) -> Fault | None:
 
 
 def _overlaps(meshes: Sequence[Mesh], resolution: int) -> list[Fault]:
+    areas = [float(_uv_areas(mesh).sum()) for mesh in meshes]
+    if sum(areas) > MAX_COVERAGE:
+        most = meshes[int(np.argmax(areas))]
+        return [Fault(most.name, f"overlaps: all meshes' together cover the light map {sum(areas):.0f} times over")]
     size = int(np.clip(OVERSAMPLING * resolution, *SAMPLES))
     corners = np.concatenate([_uv_corners(mesh) for mesh in meshes]) * size
     mesh_of = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
@@ -114,15 +119,13 @@ def _overlaps(meshes: Sequence[Mesh], resolution: int) -> list[Fault]:
 def _unwrapped(scene: Scene, settings: LightmapSettings, reasons: dict[str, str]) -> Scene:
     parts = cut_into_charts(scene.meshes)
     counts = [int(part.chart.max()) + 1 for part in parts]
+    room = (settings.resolution + settings.padding) ** 2 // (1 + settings.padding) ** 2
+    if sum(counts) > room:
+        raise _too_many_charts(sum(counts), settings)
     flat = [piece for part in parts for piece in _flat_pieces(part)]
     packed = pack_charts([piece.chart for piece in flat], settings.resolution, settings.padding)
     if packed is None:
-        raise InputError(
-            f"{len(flat)} charts with {settings.padding} texels between them do not fit into"
-            f" {settings.resolution} x {settings.resolution} texels",
-            where="lightmap.resolution",
-            remedy="Raise lightmap.resolution, or give the scene a light-map UV with fewer charts.",
-        )
+        raise _too_many_charts(len(flat), settings)
     scale, places = packed
     meshes, notes, done = [], [], 0
     for mesh, part, count in zip(scene.meshes, parts, counts, strict=True):
@@ -136,6 +139,15 @@ def _unwrapped(scene: Scene, settings: LightmapSettings, reasons: dict[str, str]
         notes.append(f"Mesh '{mesh.name}': unwrapped into {count} chart{'s' if count > 1 else ''} ({why}).")
     notes.append(f"Light map: a texel is {1.0 / scale:.3g} m wide.")
     return replace(scene, meshes=tuple(meshes), notes=(*scene.notes, *notes))
+
+
+def _too_many_charts(count: int, settings: LightmapSettings) -> InputError:
+    return InputError(
+        f"{count} charts with {settings.padding} texels between them do not fit into"
+        f" {settings.resolution} x {settings.resolution} texels",
+        where="lightmap.resolution",
+        remedy="Raise lightmap.resolution, or give the scene a light-map UV with fewer charts.",
+    )
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,9 @@ import posixpath
 from dataclasses import dataclass
 from pathlib import Path
 
-from kiln_schemas.errors import InputError, TooLarge
+from kiln_schemas.errors import InputError
 from kiln_schemas.job import check_bundle_path
-
-MAX_FILE_BYTES = 4 << 30
+from kiln_workers.scene.limits import MAX_FILE_BYTES, check_count
 
 
 @dataclass(frozen=True)
@@ -30,9 +29,7 @@ class BundleFolder:
                 check_bundle_path(reference)
             return check_bundle_path(posixpath.normpath(joined))
         except InputError as error:
-            raise InputError(
-                f"the file name '{reference}' leaves the bundle", where=self.origin, remedy=error.remedy
-            ) from None
+            raise InputError(f"the file name {error.detail}", where=self.origin, remedy=error.remedy) from None
 
     def path(self, reference: str, what: str = "file") -> Path:
         """The existing file that `reference` stands for."""
@@ -50,9 +47,8 @@ class BundleFolder:
             )
         return found
 
-    def read(self, reference: str, what: str = "file") -> bytes:
-        """The bytes of the file that `reference` stands for."""
+    def read(self, reference: str, what: str = "file", most: int = MAX_FILE_BYTES) -> bytes:
+        """The bytes of the file that `reference` stands for; TooLarge where there are more than `most`."""
         path = self.path(reference, what)
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise TooLarge(f"the {what} '{reference}' has more than {MAX_FILE_BYTES} bytes", where=self.origin)
+        check_count(path.stat().st_size, most, "bytes", self.name(reference), "Split it, or save it in binary form.")
         return path.read_bytes()

@@ -20,7 +20,7 @@ Array = npt.NDArray[Any]
 MAGIC: Final = b"KILNARR1"
 ALIGNMENT: Final = 64
 DTYPES: Final = frozenset({"|u1", "<f2", "<f4", "<f8", "<i4", "<i8"})
-MAX_HEADER_BYTES: Final = 64 << 20
+MAX_HEADER_BYTES: Final = 256 << 20
 
 
 def chunks(kind: str, body: Mapping[str, Any], arrays: Mapping[str, Array]) -> Iterator[bytes]:

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from kiln_schemas.errors import InputError, TooLarge
+from kiln_schemas.errors import InputError
+from kiln_schemas.text import told
+from kiln_workers.scene.limits import MAX_COORDINATE, MAX_MESHES, MAX_TRIANGLES, NAME_LENGTH, check_count
 from kiln_workers.scene.model import Mesh
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-MAX_TRIANGLES = 20_000_000
 SLIVER = 1e-7
 """A face whose height is below this part of its longest edge is degenerate (float32 cannot tell its plane)."""
 
@@ -44,9 +45,10 @@ def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, l
     if not np.isfinite(matrix).all():
         raise InputError("its transform is not finite", where=_where(raw), remedy="Mend the node's transform.")
     linear = matrix[:3, :3]
-    with np.errstate(over="ignore"):
-        positions = (raw.positions @ linear.T + matrix[:3, 3]).astype(np.float32)
-    _check_finite(positions, raw, "leaves the float range under its transform")
+    with np.errstate(over="ignore", invalid="ignore"):
+        placed = raw.positions @ linear.T + matrix[:3, 3]
+        _check_rows(np.abs(placed).max(axis=1, initial=0.0) <= MAX_COORDINATE, raw, f"is beyond {MAX_COORDINATE:g} m")
+    positions = placed.astype(np.float32)
     mirrored = bool(np.linalg.det(linear) < 0.0)
     faces = raw.faces[:, ::-1] if mirrored else raw.faces
 
@@ -86,10 +88,12 @@ def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, l
 
 def check_triangle_count(count: int, where: str) -> None:
     """Raise TooLarge beyond the bound; readers call it before they make copies."""
-    if count > MAX_TRIANGLES:
-        raise TooLarge(
-            f"has more than {MAX_TRIANGLES} triangles with all its instances", where=where, remedy="Simplify it."
-        )
+    check_count(count, MAX_TRIANGLES, "triangles with all its instances", where)
+
+
+def check_mesh_count(count: int, where: str) -> None:
+    """The same for the objects."""
+    check_count(count, MAX_MESHES, "objects with all its instances", where, "Join objects that share a material.")
 
 
 def face_normals(positions: npt.NDArray[np.float32] | Floats, faces: npt.NDArray[np.integer]) -> Floats:
@@ -116,10 +120,10 @@ def smooth_normals(positions: Floats, faces: npt.NDArray[np.integer]) -> Floats:
 
 
 def unique_names(names: Iterable[str]) -> list[str]:
-    """The names in order, repeated ones with ` (2)`, ` (3)`, ... appended."""
+    """The names in order, shortened, repeated ones with ` (2)`, ` (3)`, ... appended."""
     seen: dict[str, int] = {}
     out = []
-    for name in names:
+    for name in (told(name, NAME_LENGTH) for name in names):
         seen[name] = seen.get(name, 0) + 1
         out.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
     return out
@@ -155,11 +159,12 @@ def _transformed_normals(
 
 
 def _check(raw: RawMesh) -> None:
-    _check_finite(raw.positions, raw, "is not a finite number")
+    _check_rows(np.isfinite(raw.positions).all(axis=1), raw, "is not a finite number")
     if len(raw.faces) and (raw.faces.min() < 0 or raw.faces.max() >= len(raw.positions)):
-        face = int(np.argmax(((raw.faces < 0) | (raw.faces >= len(raw.positions))).any(axis=1)))
+        outside = (raw.faces < 0) | (raw.faces >= len(raw.positions))
+        face = int(np.argmax(outside.any(axis=1)))
         raise InputError(
-            f"face {face} names vertex {int(raw.faces[face].max())}, but there are {len(raw.positions)}",
+            f"face {face} names vertex {raw.faces[face][outside[face]][0]}, but there are {len(raw.positions)}",
             where=_where(raw),
             remedy="Export the mesh again.",
         )
@@ -169,10 +174,9 @@ def _check(raw: RawMesh) -> None:
             raise InputError(f"the {label} of vertex {vertex} is not a finite number", where=_where(raw))
 
 
-def _check_finite(positions: npt.NDArray[np.floating], raw: RawMesh, what: str) -> None:
-    finite = np.isfinite(positions).all(axis=1)
-    if not finite.all():
-        vertex = int(np.argmin(finite))
+def _check_rows(good: npt.ArrayLike, raw: RawMesh, what: str) -> None:
+    if not np.all(good):
+        vertex = int(np.argmin(good))
         raise InputError(
             f"the position of vertex {vertex} {what} ({', '.join(str(x) for x in raw.positions[vertex])})",
             where=_where(raw),

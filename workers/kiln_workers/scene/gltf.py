@@ -16,7 +16,15 @@ import numpy as np
 
 from kiln_schemas.errors import InputError
 from kiln_workers.scene.bundle import BundleFolder
-from kiln_workers.scene.geometry import Floats, Ints, RawMesh, check_triangle_count, place, unique_names
+from kiln_workers.scene.geometry import (
+    Floats,
+    Ints,
+    RawMesh,
+    check_mesh_count,
+    check_triangle_count,
+    place,
+    unique_names,
+)
 from kiln_workers.scene.gltf_buffers import GltfBuffers, split_glb
 from kiln_workers.scene.gltf_document import (
     Document,
@@ -44,7 +52,6 @@ READ_EXTENSIONS: Final = frozenset(
 )
 HARMLESS: Final = frozenset({"KHR_xmp", "KHR_xmp_json_ld", "KHR_materials_variants", "KHR_node_visibility"})
 TRIANGLES, STRIP, FAN = 4, 5, 6
-MAX_NODES: Final = 1_000_000
 
 
 def read_gltf(folder: Path, entry: str) -> Scene:
@@ -141,7 +148,7 @@ class _Reader:
         """Every primitive of every instance with its transform; triangles are counted before anything is copied."""
         primitives: dict[int, list[RawMesh]] = {}
         pairs: list[tuple[RawMesh, Floats]] = []
-        triangles = 0
+        triangles = instances = 0
         for item in placed:
             index = item.node.mesh
             if index is None:
@@ -150,29 +157,36 @@ class _Reader:
                 primitives[index] = self._primitives(index, materials)
             if item.node.skin is not None:
                 self.ignored["skinning"] += 1
-            for matrix in self._instance_matrices(item):
+            matrices = self._instance_matrices(item, instances)
+            instances += len(matrices)
+            for matrix in matrices:
                 for raw in primitives[index]:
                     triangles += len(raw.faces)
                     check_triangle_count(triangles, self.entry)
+                    check_mesh_count(len(pairs) + 1, self.entry)
                     suffix = raw.name[raw.name.rfind("/") :] if len(primitives[index]) > 1 else ""
                     name = item.node.name + suffix if item.node.name else raw.name
                     pairs.append((replace(raw, name=name), matrix))
         names = unique_names(raw.name for raw, _ in pairs)
         return [(replace(raw, name=name), matrix) for name, (raw, matrix) in zip(names, pairs, strict=True)]
 
-    def _instance_matrices(self, item: _Placed) -> list[Floats]:
+    def _instance_matrices(self, item: _Placed, before: int) -> list[Floats]:
+        """World transforms of a node's instances; `before` are there already."""
         content = item.node.extensions.get("EXT_mesh_gpu_instancing")
         if content is None:
             return [item.matrix]
         instancing = parse_extension(Instancing, content, f"{self.entry}: EXT_mesh_gpu_instancing")
         widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
+        for index in instancing.attributes.values():
+            count = pick(self.document.accessors, index, "accessor", self.entry).count
+            check_mesh_count(before + count, self.entry)
         parts = {
             name: self.buffers.floats(index, widths[name], name)
             for name, index in instancing.attributes.items()
             if name in widths
         }
         counts = {len(values) for values in parts.values()}
-        if len(counts) != 1 or max(counts) > MAX_NODES:
+        if len(counts) != 1:
             raise InputError(
                 f"node '{item.node.name}' has instancing attributes of {sorted(counts)} elements",
                 where=self.entry,
@@ -212,14 +226,23 @@ class _Reader:
             else np.arange(len(positions), dtype=np.int64)
         )
         material, uv_set = materials.use(primitive.material, name)
+        used: Ints | slice = slice(None)
+        if len(positions) > 2 * len(order) > 0 and order.max() < len(positions):
+            # Primitives may share one large vertex buffer: each keeps its own vertices only.
+            used, order = np.unique(order, return_inverse=True)
+
+        def attribute(key: str, width: int) -> Floats | None:
+            values = self._attribute(primitive, key, width, name, len(positions))
+            return None if values is None else values[used]
+
         return RawMesh(
             name=name,
-            positions=positions,
+            positions=positions[used],
             faces=_triangulated(order, primitive.mode),
             material=material,
-            normals=self._attribute(primitive, "NORMAL", 3, name, len(positions)),
-            uv=self._attribute(primitive, f"TEXCOORD_{uv_set}", 2, name, len(positions)),
-            lightmap_uv=self._attribute(primitive, "TEXCOORD_1", 2, name, len(positions)),
+            normals=attribute("NORMAL", 3),
+            uv=attribute(f"TEXCOORD_{uv_set}", 2),
+            lightmap_uv=attribute("TEXCOORD_1", 2),
         )
 
     def _attribute(self, primitive: Primitive, key: str, width: int, name: str, count: int) -> Floats | None:

@@ -18,10 +18,10 @@ from kiln_schemas.errors import InputError
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.container import Array
 from kiln_workers.scene.gltf_document import Accessor, Document, pick
+from kiln_workers.scene.limits import MAX_READ_BYTES, MAX_VERTICES, MAX_ZEROS, check_count
 
 COMPONENTS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 DTYPES: Final = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-MAX_ELEMENTS: Final = 200_000_000
 
 GLB_MAGIC: Final = b"glTF"
 CHUNK_JSON: Final = 0x4E4F534A
@@ -39,14 +39,15 @@ def split_glb(data: bytes, where: str) -> tuple[bytes, bytes | None]:
         raise InputError(f"is GLB version {version}", where=where, remedy="Export it as glTF 2.0.")
     if length > len(data):
         raise _broken(f"it should have {length} bytes and has {len(data)}", where)
-    chunks: dict[int, bytes] = {}
+    chunks: dict[int, bytes] = {}  # of the two kinds that are read
     offset = 12
     while offset + 8 <= length:
         size, kind = struct.unpack_from("<II", data, offset)
         offset += 8
         if offset + size > length:
             raise _broken(f"a chunk of {size} bytes leaves the file", where)
-        chunks.setdefault(kind, data[offset : offset + size])
+        if kind in (CHUNK_JSON, CHUNK_BIN) and kind not in chunks:
+            chunks[kind] = data[offset : offset + size]
         offset += size
     if CHUNK_JSON not in chunks:
         raise _broken("it has no JSON chunk", where)
@@ -71,7 +72,8 @@ class GltfBuffers:
     document: Document
     folder: BundleFolder
     binary: bytes | None
-    _loaded: dict[int, bytes] = field(default_factory=dict)
+    _loaded: dict[int, memoryview] = field(default_factory=dict)
+    _files: dict[str, bytes] = field(default_factory=dict)
 
     def file(self, uri: str, what: str) -> bytes:
         """The bytes behind a URI: inline data or a file of the bundle."""
@@ -79,7 +81,7 @@ class GltfBuffers:
             return decode_data_uri(uri, self.folder.origin)
         return self.folder.read(unquote(uri), what)
 
-    def view(self, index: int) -> bytes:
+    def view(self, index: int) -> memoryview:
         """The bytes of a buffer view."""
         where = self.folder.origin
         view = pick(self.document.buffer_views, index, "buffer view", where)
@@ -107,19 +109,23 @@ class GltfBuffers:
             raise _broken(f"accessor {index} (indices) does not hold unsigned integers", self.folder.origin)
         return values[:, 0].astype(np.int64)
 
-    def _buffer(self, index: int) -> bytes:
+    def _buffer(self, index: int) -> memoryview:
         if index not in self._loaded:
             where = self.folder.origin
             buffer = pick(self.document.buffers, index, "buffer", where)
             if buffer.uri is not None:
-                data = self.file(buffer.uri, "buffer")
+                if buffer.uri not in self._files:
+                    self._files[buffer.uri] = self.file(buffer.uri, "buffer")
+                    read = sum(map(len, self._files.values()))
+                    check_count(read, MAX_READ_BYTES, "bytes in its buffers", where)
+                data = self._files[buffer.uri]
             elif index == 0 and self.binary is not None:
                 data = self.binary
             else:
                 raise _broken(f"buffer {index} has neither a URI nor a binary chunk", where)
             if len(data) < buffer.byte_length:
                 raise _broken(f"buffer {index} should have {buffer.byte_length} bytes and has {len(data)}", where)
-            self._loaded[index] = data[: buffer.byte_length]
+            self._loaded[index] = memoryview(data)[: buffer.byte_length]
         return self._loaded[index]
 
     def _read(self, index: int, width: int, what: str) -> tuple[Accessor, Array]:
@@ -128,10 +134,10 @@ class GltfBuffers:
         label = f"accessor {index} ({what})"
         if COMPONENTS[accessor.type] != width:
             raise _broken(f"{label} is {accessor.type}, not of {width} components", where)
-        if accessor.count * width > MAX_ELEMENTS:
-            raise _broken(f"{label} has {accessor.count} elements", where)
+        check_count(accessor.count, MAX_VERTICES, f"elements in {label}", where)
         dtype = np.dtype(DTYPES[accessor.component_type])
         if accessor.buffer_view is None:
+            check_count(accessor.count * width, MAX_ZEROS, f"numbers in {label}, which has no bytes", where)
             values = np.zeros((accessor.count, width), dtype)
         else:
             stride = pick(self.document.buffer_views, accessor.buffer_view, "buffer view", where).byte_stride
@@ -162,7 +168,7 @@ class GltfBuffers:
 
 
 def _strided(
-    data: bytes,
+    data: memoryview,
     offset: int,
     stride: int | None,
     count: int,

@@ -6,10 +6,12 @@ malformed field is refused with its path. Unknown fields are ignored, as the spe
 
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
 from kiln_schemas.errors import InputError
+from kiln_schemas.text import told
+from kiln_workers.scene.limits import MAX_ENTRIES, MAX_JSON_BYTES, MAX_JSON_ITEMS, NAME_LENGTH, check_count
 
 Index = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Count = Annotated[int, Field(ge=1, le=2**31 - 1)]
@@ -20,6 +22,8 @@ Vector4 = tuple[float, float, float, float]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 Extensions = dict[str, dict[str, Any]]
 T = TypeVar("T")
+Name = Annotated[str, AfterValidator(lambda name: told(name, NAME_LENGTH))]
+Table = Annotated[list[T], Field(max_length=MAX_ENTRIES)]
 
 
 class _Part(BaseModel):
@@ -73,18 +77,18 @@ class Primitive(_Part):
     indices: Index | None = None
     material: Index | None = None
     mode: Annotated[int, Field(ge=0, le=6)] = 4
-    targets: list[Any] = []
+    targets: Table[Any] = []
     extensions: Extensions = {}
 
 
 class MeshPart(_Part):
-    name: str = ""
-    primitives: list[Primitive] = []
+    name: Name = ""
+    primitives: Table[Primitive] = []
 
 
 class Node(_Part):
-    name: str = ""
-    children: list[Index] = []
+    name: Name = ""
+    children: Table[Index] = []
     mesh: Index | None = None
     skin: Index | None = None
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
@@ -95,7 +99,7 @@ class Node(_Part):
 
 
 class ScenePart(_Part):
-    nodes: list[Index] = []
+    nodes: Table[Index] = []
 
 
 class TextureInfo(_Part):
@@ -113,7 +117,7 @@ class MetallicRoughness(_Part):
 
 
 class MaterialPart(_Part):
-    name: str = ""
+    name: Name = ""
     pbr_metallic_roughness: MetallicRoughness = MetallicRoughness()
     normal_texture: TextureInfo | None = None
     emissive_factor: tuple[Unit, Unit, Unit] = (0.0, 0.0, 0.0)
@@ -136,7 +140,7 @@ class Sampler(_Part):
 
 
 class ImagePart(_Part):
-    name: str = ""
+    name: Name = ""
     uri: str | None = None
     buffer_view: Index | None = None
 
@@ -166,7 +170,7 @@ class Spot(_Part):
 
 
 class Light(_Part):
-    name: str = ""
+    name: Name = ""
     type: Literal["point", "spot", "directional"]
     color: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = (
         1,
@@ -178,7 +182,7 @@ class Light(_Part):
 
 
 class Lights(_Part):
-    lights: list[Light] = []
+    lights: Table[Light] = []
 
 
 class LightIndex(_Part):
@@ -190,24 +194,26 @@ class Document(_Part):
 
     asset: Asset
     scene: Index | None = None
-    scenes: list[ScenePart] = []
-    nodes: list[Node] = []
-    meshes: list[MeshPart] = []
-    materials: list[MaterialPart] = []
-    accessors: list[Accessor] = []
-    buffer_views: list[BufferView] = []
-    buffers: list[Buffer] = []
-    images: list[ImagePart] = []
-    textures: list[TexturePart] = []
-    samplers: list[Sampler] = []
-    animations: list[Any] = []
-    extensions_used: list[str] = []
-    extensions_required: list[str] = []
+    scenes: Table[ScenePart] = []
+    nodes: Table[Node] = []
+    meshes: Table[MeshPart] = []
+    materials: Table[MaterialPart] = []
+    accessors: Table[Accessor] = []
+    buffer_views: Table[BufferView] = []
+    buffers: Table[Buffer] = []
+    images: Table[ImagePart] = []
+    textures: Table[TexturePart] = []
+    samplers: Table[Sampler] = []
+    animations: Table[Any] = []
+    extensions_used: Table[str] = []
+    extensions_required: Table[str] = []
     extensions: Extensions = {}
 
 
 def parse_document(text: bytes, where: str) -> Document:
     """The document of a file's JSON; InputError names the first field at fault."""
+    check_count(len(text), MAX_JSON_BYTES, "bytes of JSON", where, "Save it as GLB.")
+    check_count(text.count(b","), MAX_JSON_ITEMS, "commas in its JSON", where)
     try:
         return Document.model_validate_json(text)
     except ValidationError as error:

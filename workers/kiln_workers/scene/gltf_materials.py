@@ -5,6 +5,7 @@ where a material's textures use several sets the base colour's wins, with a note
 are linearised here, since the model's float images are linear.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -22,6 +23,7 @@ from kiln_workers.scene.gltf_document import (
     pick,
 )
 from kiln_workers.scene.images import decode_image
+from kiln_workers.scene.limits import MAX_IMAGE_BYTES
 from kiln_workers.scene.model import Float32, Image, Material, TextureRef
 
 WRAP: Final = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -119,21 +121,22 @@ class MaterialTable:
         key = (index, srgb)
         if key not in self._image_index:
             part = pick(self.document.images, index, "image", where)
-            name = part.name or (part.uri if part.uri and not part.uri.startswith("data:") else "") or f"image {index}"
+            file = part.uri if part.uri and not part.uri.startswith("data:") else ""
+            name = part.name or file or f"image {index}"
             if part.uri is not None:
-                data = self.buffers.file(part.uri, "texture")
+                data: bytes | memoryview = self.buffers.file(part.uri, "texture")
             elif part.buffer_view is not None:
                 data = self.buffers.view(part.buffer_view)
             else:
                 raise InputError(f"image {index} has neither a URI nor a buffer view", where=where)
             self._image_index[key] = len(self.images)
-            self.images.append(make_image(data, name, srgb, f"{where}, texture '{name}'"))
+            self.images.append(make_image(bytes(data), name, srgb, f"{where}, texture '{name}'", self.images))
         return self._image_index[key]
 
 
-def make_image(data: bytes, name: str, srgb: bool, where: str) -> Image:
-    """Decode a texture: 8-bit images stay as stored, all others become linear floats."""
-    decoded = decode_image(data, where)
+def make_image(data: bytes, name: str, srgb: bool, where: str, others: Sequence[Image]) -> Image:
+    """Decode a texture: 8-bit images stay as stored, all others become linear floats; `others` are there already."""
+    decoded = decode_image(data, where, MAX_IMAGE_BYTES - sum(other.pixels.nbytes for other in others))
     if decoded.pixels.dtype == np.uint8:
         return Image(name, decoded.pixels, srgb)
     pixels = np.asarray(decoded.pixels, dtype=np.float32)

@@ -15,10 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import OpenImageIO as oiio
 
-from kiln_schemas.errors import InputError, TooLarge
-
-MAX_SIDE: Final = 16384
-"""Pixels along a side, at most."""
+from kiln_schemas.errors import InputError
+from kiln_workers.scene.limits import MAX_IMAGE_BYTES, MAX_PIXELS, MAX_SIDE, check_count
 
 SIGNATURES: Final[Mapping[str, bytes]] = {
     "png": b"\x89PNG\r\n\x1a\n",
@@ -27,6 +25,11 @@ SIGNATURES: Final[Mapping[str, bytes]] = {
     "hdr": b"#?",
 }
 HDR_FORMATS: Final = frozenset({"exr", "hdr"})
+DECODERS: Final[Mapping[str, str]] = {"png": "png", "jpg": "jpeg", "exr": "openexr", "hdr": "hdr"}
+"""OpenImageIO's names of the formats."""
+
+# What a decoder refuses is not offered to the fifty others.
+oiio.attribute("try_all_readers", 0)
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ def image_format(data: bytes) -> str | None:
     return next((name for name, magic in SIGNATURES.items() if data.startswith(magic)), None)
 
 
-def decode_image(data: bytes, where: str) -> Decoded:
+def decode_image(data: bytes, where: str, most_bytes: int = MAX_IMAGE_BYTES) -> Decoded:
     """Decode an image; InputError names `where` if it is of another format, damaged, or too large."""
     kind = image_format(data)
     if kind is None:
@@ -52,24 +55,25 @@ def decode_image(data: bytes, where: str) -> Decoded:
     with tempfile.TemporaryDirectory(prefix="kiln-image-") as folder:
         path = Path(folder) / f"image.{kind}"
         path.write_bytes(data)
-        return Decoded(_read(path, kind, where), kind)
+        return Decoded(_read(path, kind, where, most_bytes), kind)
 
 
-def _read(path: Path, kind: str, where: str) -> npt.NDArray[np.uint8] | npt.NDArray[np.float32]:
+def _read(path: Path, kind: str, where: str, most_bytes: int) -> npt.NDArray[np.uint8] | npt.NDArray[np.float32]:
     source = oiio.ImageInput.open(str(path))
-    if source is None:
+    if source is None or source.format_name() != DECODERS[kind]:
         raise InputError(f"cannot be decoded as {kind}: {oiio.geterror()}", where=where, remedy="Save it again.")
     try:
         spec = source.spec()
-        if spec.width > MAX_SIDE or spec.height > MAX_SIDE:
-            raise TooLarge(
-                f"has {spec.width} x {spec.height} pixels, at most {MAX_SIDE} a side are read",
-                where=where,
-                remedy="Make it smaller.",
-            )
+        size = f"({spec.width} x {spec.height})"
+        check_count(max(spec.width, spec.height), MAX_SIDE, f"pixels along a side {size}", where, "Make it smaller.")
+        check_count(spec.width * spec.height, MAX_PIXELS, f"pixels {size}", where, "Make it smaller.")
+        if spec.depth > 1:
+            raise InputError(f"is a volume of {spec.depth} layers", where=where, remedy="Save one layer.")
         if (spec.width, spec.height, spec.x, spec.y) != (spec.full_width, spec.full_height, spec.full_x, spec.full_y):
             raise InputError("its data window is not its display window", where=where, remedy="Save it uncropped.")
         narrow = kind in ("png", "jpg") and spec.format.basetype == oiio.UINT8
+        decoded = spec.width * spec.height * min(spec.nchannels, 4) * (1 if narrow else 4)
+        check_count(decoded, most_bytes, "bytes when it is decoded beside the others", where, "Use smaller textures.")
         pixels = source.read_image(0, 0, 0, min(spec.nchannels, 4), oiio.UINT8 if narrow else oiio.FLOAT)
         if pixels is None:
             raise InputError(f"is damaged: {source.geterror()}", where=where, remedy="Save it again.")

@@ -12,6 +12,7 @@ from kiln_schemas.errors import InputError
 from kiln_schemas.tasks import EnvironmentRef
 from kiln_workers.scene.environment import load_environment
 from kiln_workers.scene.gltf import read_gltf
+from kiln_workers.scene.limits import READING_S, deadline
 from kiln_workers.scene.mitsuba_xml import read_mitsuba_xml
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.obj import read_obj
@@ -35,6 +36,11 @@ def load_scene(folder: Path, entry: str, environment: EnvironmentRef | None = No
             where=entry,
             remedy=f"Use one of {', '.join(READERS)}.",
         )
+    with deadline(READING_S, entry, "read", "Simplify it, or save it as GLB."):
+        return _read(reader, folder, entry, environment)
+
+
+def _read(reader: Callable[[Path, str], Scene], folder: Path, entry: str, environment: EnvironmentRef | None) -> Scene:
     scene = reader(folder, entry)
     if not scene.triangles:
         raise InputError("has no faces", where=entry, remedy="Export at least one mesh with triangles of some area.")

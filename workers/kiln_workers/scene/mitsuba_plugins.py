@@ -14,6 +14,7 @@ import numpy as np
 
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.geometry import RawMesh
+from kiln_workers.scene.limits import MAX_FILE_BYTES, MAX_TEXT_BYTES
 from kiln_workers.scene.mitsuba_values import Colour, Plugin
 from kiln_workers.scene.model import Material
 from kiln_workers.scene.obj import parse_obj
@@ -58,7 +59,8 @@ def surface_material(plugin: Plugin) -> tuple[Material, list[str]]:
 
 def _file_meshes(plugin: Plugin, folder: Path, material: int) -> list[RawMesh]:
     name = plugin.text("filename")
-    data = BundleFolder(folder, f"shape '{plugin.kind}'").read(name, "mesh file")
+    most = MAX_TEXT_BYTES if plugin.kind == "obj" else MAX_FILE_BYTES
+    data = BundleFolder(folder, f"shape '{plugin.kind}'").read(name, "mesh file", most)
     if plugin.kind == "ply":
         return [parse_ply(data, name, material)]
     return [replace(mesh, material=material) for mesh in parse_obj(data, name).meshes]
@@ -172,6 +174,8 @@ def _twosided(plugin: Plugin) -> tuple[Material, list[str]]:
     inner = [child for child in plugin.children if child.tag == "bsdf"]
     if len(inner) != 1:
         raise plugin.fail(f"it holds {len(inner)} BSDFs", "Use one BSDF for both sides.")
+    if inner[0].kind == plugin.kind:
+        raise plugin.fail("it holds another twosided BSDF", "Leave one of them out.")
     material, notes = surface_material(inner[0])
     return replace(material, double_sided=True), notes
 

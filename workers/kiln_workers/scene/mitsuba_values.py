@@ -11,11 +11,14 @@ import numpy as np
 
 from kiln_schemas.errors import InputError
 from kiln_workers.scene.geometry import Floats
+from kiln_workers.scene.limits import check_count
 from kiln_workers.scene.xml_nodes import Node
 
 Colour = tuple[float, float, float]
 
 OBJECT_TAGS: Final = frozenset({"shape", "bsdf", "emitter", "texture", "medium"})
+MAX_VALUE: Final = 1 << 16
+"""Characters of a value that names variables, once they are filled in: variables of variables grow without bound."""
 VALUE_TAGS: Final = frozenset(
     {"float", "integer", "boolean", "string", "rgb", "spectrum", "point", "vector", "transform"}
 )
@@ -83,7 +86,8 @@ class Plugin:
         matrix = np.eye(4)
         node = self.values.get(name)
         for step in [] if node is None else node.children:
-            matrix = _operation(step, self) @ matrix
+            with np.errstate(over="ignore", invalid="ignore"):  # `place` refuses what is not finite
+                matrix = _operation(step, self) @ matrix
         return matrix
 
     def _floats(self, name: str, default: tuple[float, ...], counts: tuple[int, ...]) -> tuple[float, ...]:
@@ -163,7 +167,9 @@ def substituted(node: Node, variables: Mapping[str, str], where: str) -> dict[st
     """The attributes of an element with `$name` replaced; InputError for a name without a default."""
     out = {}
     for key, value in node.attributes.items():
-        for name in sorted(variables, key=len, reverse=True):
+        for name in sorted(variables, key=len, reverse=True) if "$" in value else ():
+            grown = len(value) + value.count(f"${name}") * len(variables[name])
+            check_count(grown, MAX_VALUE, "characters in one value with its variables", f"{where}, line {node.line}")
             value = value.replace(f"${name}", variables[name])
         if "$" in value:
             raise InputError(

@@ -14,14 +14,17 @@ import numpy as np
 from kiln_schemas.errors import InputError
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.environment import read_environment
-from kiln_workers.scene.geometry import check_triangle_count, place, unique_names
+from kiln_workers.scene.geometry import check_mesh_count, check_triangle_count, place, unique_names
+from kiln_workers.scene.limits import MAX_TEXT_BYTES, check_count
 from kiln_workers.scene.mitsuba_plugins import shape_meshes, surface_material
 from kiln_workers.scene.mitsuba_values import OBJECT_TAGS, VALUE_TAGS, Plugin, substituted
 from kiln_workers.scene.model import Environment, LightKind, Material, Mesh, PunctualLight, Scene
 from kiln_workers.scene.xml_nodes import Node, parse_xml
 
 IGNORED_TAGS: Final = frozenset({"sensor", "integrator", "film", "sampler", "rfilter"})
-MAX_INCLUDES: Final = 16
+MAX_INCLUDES: Final = 64
+"""Files that are included, over all; so a file may not include itself for ever."""
+MAX_VARIABLES: Final = 256
 
 
 def read_mitsuba_xml(folder: Path, entry: str) -> Scene:
@@ -35,15 +38,16 @@ class _Reader:
     bundle: BundleFolder
     variables: dict[str, str] = field(default_factory=dict)
     known: dict[str, Plugin] = field(default_factory=dict)
-    materials: list[Material] = field(default_factory=list)
+    materials: dict[Material, int] = field(default_factory=dict)
     meshes: list[Mesh] = field(default_factory=list)
     lights: list[PunctualLight] = field(default_factory=list)
     environment: Environment | None = None
     notes: list[str] = field(default_factory=list)
     triangles: int = 0
+    includes: int = 0
 
     def read(self) -> Scene:
-        for plugin in self._top_level(self.bundle, depth=0):
+        for plugin in self._top_level(self.bundle):
             if plugin.tag == "shape":
                 self._shape(plugin)
             elif plugin.tag == "emitter":
@@ -56,9 +60,9 @@ class _Reader:
             meshes, tuple(self.materials), (), tuple(self.lights), self.environment, tuple(dict.fromkeys(self.notes))
         )
 
-    def _top_level(self, bundle: BundleFolder, depth: int) -> list[Plugin]:
+    def _top_level(self, bundle: BundleFolder) -> list[Plugin]:
         where = bundle.origin
-        root = parse_xml(bundle.read(Path(where).name, "scene"), where)
+        root = parse_xml(bundle.read(Path(where).name, "scene", MAX_TEXT_BYTES), where)
         if root.tag != "scene":
             raise InputError(f"begins with <{root.tag}>, not with <scene>", where=where)
         plugins: list[Plugin] = []
@@ -66,12 +70,13 @@ class _Reader:
             attributes = substituted(node, self.variables, where)
             if node.tag == "default":
                 self.variables.setdefault(attributes.get("name", ""), attributes.get("value", ""))
+                check_count(len(self.variables), MAX_VARIABLES, "variables", where)
             elif node.tag == "include":
-                if depth >= MAX_INCLUDES:
-                    raise InputError("includes nest too deeply", where=where)
+                self.includes += 1
+                check_count(self.includes, MAX_INCLUDES, "included files", where)
                 inner = BundleFolder(bundle.folder, bundle.name(attributes.get("filename", "")))
                 bundle.path(attributes.get("filename", ""), "included file")
-                plugins += self._top_level(inner, depth + 1)
+                plugins += self._top_level(inner)
             elif node.tag in OBJECT_TAGS:
                 plugins.append(self._plugin(node, bundle))
             elif node.tag not in IGNORED_TAGS and node.tag not in VALUE_TAGS:
@@ -116,11 +121,11 @@ class _Reader:
         for child in plugin.children:
             if child.tag == "emitter":
                 material = replace(material, emission=child.colour("radiance", (1.0, 1.0, 1.0)))
-        if material not in self.materials:
-            self.materials.append(material)
-        for raw in shape_meshes(plugin, self.bundle.folder, self.materials.index(material)):
+        number = self.materials.setdefault(material, len(self.materials))
+        for raw in shape_meshes(plugin, self.bundle.folder, number):
             self.triangles += len(raw.faces)
             check_triangle_count(self.triangles, plugin.where)
+            check_mesh_count(len(self.meshes) + 1, plugin.where)
             mesh, notes = place(raw, plugin.transform())
             self.notes += notes
             self.meshes += [mesh] if mesh is not None else []

@@ -6,28 +6,41 @@ used where present; otherwise Phong's exponent gives alpha^2 = 2 / (Ns + 2) (Wal
 highlight roughness 1. `Ke` is radiance.
 """
 
-from collections.abc import Iterator
+import array
+import io
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final, TypeAlias
 
 import numpy as np
 
 from kiln_schemas.errors import InputError
+from kiln_schemas.tasks import PATH_LENGTH
+from kiln_schemas.text import told
 from kiln_workers.scene.bundle import BundleFolder
-from kiln_workers.scene.geometry import RawMesh, check_triangle_count, place, unique_names
+from kiln_workers.scene.geometry import RawMesh, check_mesh_count, check_triangle_count, place, unique_names
 from kiln_workers.scene.gltf_materials import make_image
+from kiln_workers.scene.limits import MAX_ENTRIES, MAX_TEXT_BYTES, NAME_LENGTH, check_count
 from kiln_workers.scene.model import Image, Material, Mesh, Scene, TextureRef
 
 DEFAULT = Material("default")
+MAP_LENGTH: Final = 2 * PATH_LENGTH
+READ_KEYS: Final = frozenset({"Kd", "Ke", "Ks", "Ns", "Pm", "Pr", "map_Kd", "map_Ke"})
+
+
+WIDTHS: Final = {"v": 3, "vt": 2, "vn": 3}
+Doubles: TypeAlias = "array.array[float]"
+Numbers: TypeAlias = "array.array[int]"
 
 
 @dataclass
 class _Group:
-    """Faces of one object and material: corners as (position, texture, normal) indices, -1 where absent."""
+    """Faces of one object and material: corners as flat (position, texture, normal) indices, -1 where absent."""
 
     name: str
     material: str
-    corners: list[tuple[int, int, int]] = field(default_factory=list)
+    corners: Numbers = field(default_factory=lambda: array.array("i"))
 
 
 @dataclass
@@ -42,24 +55,26 @@ class ObjFile:
 def read_obj(folder: Path, entry: str) -> Scene:
     """The scene of an OBJ file and its material libraries."""
     bundle = BundleFolder(folder, entry)
-    parsed = parse_obj(bundle.read(Path(entry).name, "scene"), entry)
+    parsed = parse_obj(bundle.read(Path(entry).name, "scene", MAX_TEXT_BYTES), entry)
     notes: list[str] = []
-    images: list[Image] = []
-    known = _read_libraries(bundle, parsed.libraries, images, notes)
+    textures = _Textures()
+    known = _read_libraries(bundle, parsed.libraries, set(parsed.materials), textures, notes)
     missing = sorted({name for name in parsed.materials if name and name not in known})
-    notes += [f"'{entry}': material '{name}' is not defined; the default is used." for name in missing]
+    notes += [
+        f"'{entry}': material '{told(name, NAME_LENGTH)}' is not defined; the default is used." for name in missing
+    ]
     materials = tuple(known.get(name, DEFAULT) for name in parsed.materials)
     meshes: list[Mesh] = []
     for raw in parsed.meshes:
         mesh, said = place(raw)
         notes += said
         meshes += [mesh] if mesh is not None else []
-    return Scene(tuple(meshes), materials, tuple(images), notes=tuple(notes))
+    return Scene(tuple(meshes), materials, tuple(textures.images), notes=tuple(notes))
 
 
 def parse_obj(data: bytes, where: str) -> ObjFile:
     """Meshes of an OBJ file, one for each object and material; InputError names the line at fault."""
-    vectors: dict[str, list[tuple[float, ...]]] = {"v": [], "vt": [], "vn": []}
+    vectors: dict[str, Doubles] = {key: array.array("d") for key in WIDTHS}
     groups: dict[tuple[str, str], _Group] = {}
     libraries: list[str] = []
     name, material = Path(where).stem, ""
@@ -67,7 +82,10 @@ def parse_obj(data: bytes, where: str) -> ObjFile:
     for number, key, rest in _lines(data):
         try:
             if key in vectors:
-                vectors[key].append(tuple(float(word) for word in rest.split()[: 2 if key == "vt" else 3]))
+                row = [float(word) for word in rest.split(maxsplit=WIDTHS[key])[: WIDTHS[key]]]
+                if len(row) < WIDTHS[key]:
+                    raise ValueError("too few numbers")
+                vectors[key].extend(row)
             elif key in ("o", "g"):
                 name = rest or name
             elif key == "usemtl":
@@ -75,37 +93,49 @@ def parse_obj(data: bytes, where: str) -> ObjFile:
             elif key == "mtllib":
                 libraries.append(rest)
             elif key == "f":
-                fan = _fan([_corner(word, vectors) for word in rest.split()])
-                triangles += len(fan) // 3
+                words = rest.split()
+                triangles += max(len(words) - 2, 0)
                 check_triangle_count(triangles, where)
-                groups.setdefault((name, material), _Group(name, material)).corners.extend(fan)
+                fan = _fan([_corner(word, vectors) for word in words])
+                if (name, material) not in groups:
+                    check_mesh_count(len(groups) + 1, where)
+                    groups[name, material] = _Group(name, material)
+                groups[name, material].corners.extend(fan)
         except (ValueError, IndexError):
             raise InputError(
                 f"line {number} is not understood: '{key} {rest[:60]}'", where=where, remedy="Export it again."
             ) from None
-    materials = list(dict.fromkeys(group.material for group in groups.values()))
-    arrays = {key: _array(rows, 2 if key == "vt" else 3, where) for key, rows in vectors.items()}
+    numbers: dict[str, int] = {}
+    for group in groups.values():
+        numbers.setdefault(group.material, len(numbers))
+    arrays = {key: np.array(flat, dtype=np.float64).reshape(-1, WIDTHS[key]) for key, flat in vectors.items()}
     names = unique_names(group.name for group in groups.values())
     meshes = [
-        _mesh(group, name, materials.index(group.material), arrays)
-        for name, group in zip(names, groups.values(), strict=True)
+        _mesh(group, name, numbers[group.material], arrays) for name, group in zip(names, groups.values(), strict=True)
     ]
-    return ObjFile(meshes, materials, libraries)
+    return ObjFile(meshes, list(numbers), libraries)
 
 
 def _lines(data: bytes) -> Iterator[tuple[int, str, str]]:
-    text = data.decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
-    for number, line in enumerate(text.splitlines(), start=1):
-        key, _, rest = line.split("#", 1)[0].strip().partition(" ")
+    """Number, keyword and the rest of every statement; a line that ends with a backslash goes on in the next."""
+    joined, first = "", 0
+    for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", errors="replace"), start=1):
+        first = first or number
+        line = line.rstrip("\n")
+        if line.endswith("\\"):
+            joined += line[:-1] + " "
+            continue
+        key, _, rest = (joined + line).split("#", 1)[0].strip().partition(" ")
         if key:
-            yield number, key, rest.strip()
+            yield first, key, rest.strip()
+        joined, first = "", 0
 
 
-def _corner(word: str, vectors: dict[str, list[tuple[float, ...]]]) -> tuple[int, int, int]:
+def _corner(word: str, vectors: dict[str, Doubles]) -> tuple[int, int, int]:
     parts = [*word.split("/"), "", ""][:3]
     found = []
-    for part, key in zip(parts, ("v", "vt", "vn"), strict=True):
-        count = len(vectors[key])
+    for part, key in zip(parts, WIDTHS, strict=True):
+        count = len(vectors[key]) // WIDTHS[key]
         index = int(part) if part else 0
         resolved = index - 1 if index > 0 else count + index if index < 0 else -1
         if part and not 0 <= resolved < count:
@@ -114,22 +144,21 @@ def _corner(word: str, vectors: dict[str, list[tuple[float, ...]]]) -> tuple[int
     return found[0], found[1], found[2]
 
 
-def _fan(corners: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+def _fan(corners: list[tuple[int, int, int]]) -> list[int]:
     if len(corners) < 3:
         raise ValueError("a face has three corners or more")
-    return [corner for i in range(1, len(corners) - 1) for corner in (corners[0], corners[i], corners[i + 1])]
-
-
-def _array(rows: list[tuple[float, ...]], width: int, where: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    if any(len(row) < width for row in rows):
-        raise InputError(f"a vertex has fewer than {width} numbers", where=where, remedy="Export it again.")
-    return np.array(rows, dtype=np.float64).reshape(-1, width)
+    return [
+        index
+        for i in range(1, len(corners) - 1)
+        for corner in (corners[0], corners[i], corners[i + 1])
+        for index in corner
+    ]
 
 
 def _mesh(
     group: _Group, name: str, material: int, arrays: dict[str, np.ndarray[tuple[int, int], np.dtype[np.float64]]]
 ) -> RawMesh:
-    corners, faces = np.unique(np.array(group.corners, dtype=np.int64), axis=0, return_inverse=True)
+    corners, faces = np.unique(np.array(group.corners, dtype=np.int64).reshape(-1, 3), axis=0, return_inverse=True)
     uv = None
     if (corners[:, 1] >= 0).all():
         uv = arrays["vt"][corners[:, 1]] * [1.0, -1.0] + [0.0, 1.0]  # v upwards in OBJ
@@ -143,9 +172,31 @@ def _mesh(
     )
 
 
+@dataclass
+class _Textures:
+    """Images in the order of first use; each file is decoded once."""
+
+    images: list[Image] = field(default_factory=list)
+    known: dict[str, int] = field(default_factory=dict)
+
+    def use(self, line: str | None, title: str, bundle: BundleFolder) -> TextureRef | None:
+        """The texture of a map statement."""
+        if not line:
+            return None
+        name = _map_file(line, bundle)
+        path = bundle.name(name)
+        if path not in self.known:
+            data = bundle.read(name, "texture")
+            image = make_image(data, name, True, f"material '{title}', texture '{name}'", self.images)
+            self.known[path] = len(self.images)
+            self.images.append(image)
+        return TextureRef(self.known[path])
+
+
 def _read_libraries(
-    bundle: BundleFolder, libraries: list[str], images: list[Image], notes: list[str]
+    bundle: BundleFolder, libraries: list[str], used: Collection[str], textures: _Textures, notes: list[str]
 ) -> dict[str, Material]:
+    """The materials in `used` that the libraries define."""
     materials: dict[str, Material] = {}
     for library in dict.fromkeys(name for line in libraries for name in _library_names(line, bundle)):
         name = bundle.name(library)
@@ -155,13 +206,15 @@ def _read_libraries(
         inner = BundleFolder(bundle.folder, name)
         tables: dict[str, dict[str, str]] = {}
         current: dict[str, str] = {}
-        for _, key, rest in _lines(bundle.read(library, "material library")):
+        for _, key, rest in _lines(bundle.read(library, "material library", MAX_TEXT_BYTES)):
             if key == "newmtl":
                 current = tables.setdefault(rest, {})
-            else:
+                check_count(len(tables), MAX_ENTRIES, "materials", name)
+            elif key in READ_KEYS:
                 current[key] = rest
         for title, table in tables.items():
-            materials[title] = _material(title, table, inner, images)
+            if title in used:
+                materials[title] = _material(told(title, NAME_LENGTH), table, inner, textures)
     return materials
 
 
@@ -170,7 +223,7 @@ def _library_names(line: str, bundle: BundleFolder) -> list[str]:
     return [line] if (bundle.folder / bundle.name(line)).is_file() else line.split()
 
 
-def _material(title: str, table: dict[str, str], bundle: BundleFolder, images: list[Image]) -> Material:
+def _material(title: str, table: dict[str, str], bundle: BundleFolder, textures: _Textures) -> Material:
     def numbers(key: str, default: tuple[float, ...]) -> tuple[float, ...]:
         if key not in table:
             return default
@@ -191,25 +244,17 @@ def _material(title: str, table: dict[str, str], bundle: BundleFolder, images: l
     return Material(
         name=title,
         base_color=(red, green, blue, 1.0),
-        base_color_texture=_texture(table.get("map_Kd"), title, bundle, images),
+        base_color_texture=textures.use(table.get("map_Kd"), title, bundle),
         metallic=min(numbers("Pm", (0.0,))[0], 1.0),
         roughness=min(numbers("Pr", (phong,))[0], 1.0),
         emission=(glow[0], glow[1], glow[2]),
-        emission_texture=_texture(table.get("map_Ke"), title, bundle, images) if max(glow) > 0.0 else None,
+        emission_texture=textures.use(table.get("map_Ke"), title, bundle) if max(glow) > 0.0 else None,
     )
-
-
-def _texture(line: str | None, title: str, bundle: BundleFolder, images: list[Image]) -> TextureRef | None:
-    if not line:
-        return None
-    name = _map_file(line, bundle)
-    data = bundle.read(name, "texture")
-    images.append(make_image(data, name, True, f"material '{title}', texture '{name}'"))
-    return TextureRef(len(images) - 1)
 
 
 def _map_file(line: str, bundle: BundleFolder) -> str:
     """The file name of a map statement: behind its options the longest that is a file's, as names may hold spaces."""
+    check_count(len(line), MAP_LENGTH, "characters in a map statement", bundle.origin)
     if not line.startswith("-"):
         return line
     words = line.split()

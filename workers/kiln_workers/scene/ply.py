@@ -4,6 +4,7 @@ A PLY file has no material; the surface is white plaster of roughness 1 (the mod
 """
 
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ def read_ply(folder: Path, entry: str) -> Scene:
 
 def parse_ply(data: bytes, where: str, material: int = 0) -> RawMesh:
     """The mesh of a PLY file; InputError names `where` if it cannot be read."""
+    _check_header(data, where)
     try:
         parsed = load_ply(io.BytesIO(data), skip_materials=True)
         faces = np.asarray(triangulate_quads(parsed.get("faces", [])), dtype=np.int64).reshape(-1, 3)
@@ -46,6 +48,18 @@ def parse_ply(data: bytes, where: str, material: int = 0) -> RawMesh:
         normals=normals if normals is not None and len(normals) == len(positions) else None,
         uv=uv * [1.0, -1.0] + [0.0, 1.0] if uv is not None and len(uv) == len(positions) else None,
     )
+
+
+def _check_header(data: bytes, where: str) -> None:
+    """Hold the counts in the header to the bytes that there are, before anything is made of that size."""
+    header, end, body = data.partition(b"end_header")
+    counts = [int(count) for count in re.findall(rb"^\s*element\s+\S+\s+(\d{1,18})\s*$", header, re.MULTILINE)]
+    if end and sum(counts) > len(body):  # an element has a byte at least
+        raise InputError(
+            f"is cut off: its header tells of {sum(counts)} elements, {len(body)} bytes follow",
+            where=where,
+            remedy="Export it again.",
+        )
 
 
 def _columns(vertex: Any, *choices: tuple[str, ...]) -> Floats | None:

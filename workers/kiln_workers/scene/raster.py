@@ -90,8 +90,20 @@ def _squares(corners: Floats, width: int, height: int) -> Iterator[tuple[Ints, I
     low = np.floor(corners.min(axis=1)).astype(np.int64)
     high = np.floor(corners.max(axis=1)).astype(np.int64) + 1
     low, high = np.clip(low, 0, [width, height]), np.clip(high, 0, [width, height])
+    rows = np.cumsum(np.maximum(high[:, 1] - low[:, 1], 0))
+    begin = 0
+    while begin < len(corners):
+        done = rows[begin - 1] if begin else 0
+        end = max(int(np.searchsorted(rows, done + BATCH_SQUARES, side="right")), begin + 1)
+        for face, column, row in _squares_of_few(low[begin:end], high[begin:end]):
+            yield face + begin, column, row
+        begin = end
+
+
+def _squares_of_few(low: Ints, high: Ints) -> Iterator[tuple[Ints, Ints, Ints]]:
+    """The same of boxes [F, 2], all of whose rows are held at once."""
     rows = np.maximum(high[:, 1] - low[:, 1], 0)
-    span_face = np.repeat(np.arange(len(corners)), rows)
+    span_face = np.repeat(np.arange(len(low)), rows)
     span_row = _counters(rows) + low[span_face, 1]
     columns = np.maximum(high[:, 0] - low[:, 0], 0)[span_face]
     ends = np.cumsum(columns)

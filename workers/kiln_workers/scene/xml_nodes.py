@@ -9,9 +9,9 @@ from typing import Final
 from xml.parsers import expat
 
 from kiln_schemas.errors import InputError, TooLarge
+from kiln_workers.scene.limits import MAX_ENTRIES
 
 MAX_DEPTH: Final = 32
-MAX_ELEMENTS: Final = 200_000
 
 
 @dataclass
@@ -34,7 +34,7 @@ def parse_xml(data: bytes, where: str) -> Node:
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal count
         count += 1
-        if len(stack) > MAX_DEPTH or count > MAX_ELEMENTS:
+        if len(stack) > MAX_DEPTH or count > MAX_ENTRIES:
             raise TooLarge("nests too deeply or has too many elements", where=where, remedy="Simplify it.")
         node = Node(tag, attributes, parser.CurrentLineNumber)
         stack[-1].children.append(node)
@@ -52,6 +52,6 @@ def parse_xml(data: bytes, where: str) -> Node:
     parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
     try:
         parser.Parse(data, True)
-    except expat.ExpatError as error:
+    except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two of encodings
         raise InputError(f"is not well-formed XML: {error}", where=where, remedy="Mend the file.") from None
     return root.children[0]

@@ -1,6 +1,7 @@
 """Read the scene, give it a light map, lay out the store: everything the farm needs before the first ray."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +13,7 @@ from kiln_workers.render.between import between_maps
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import pack_scene, scene_hash
 from kiln_workers.scene.atlas import assign_lightmap_uv
+from kiln_workers.scene.limits import LAYOUT_S, deadline
 from kiln_workers.scene.load import check_light, load_scene
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.texel_map import TexelMap, pack_texel_map
@@ -20,6 +22,7 @@ from kiln_workers.stages.tiles import plan_tiles
 from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
 from kiln_workers.store.light_field import LightFieldStore
 
+MOST_NOTES: Final = 1000
 STEPS: Final = (
     "fetching the scene",
     "reading the scene",
@@ -43,9 +46,10 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
     step(1)
     scene = check_light(load_scene(folder, bundle.entry, bundle.environment))
     step(2)
-    scene = assign_lightmap_uv(scene, settings.lightmap)
-    step(3)
-    texel_map = build_texel_map(scene, settings.lightmap.resolution)
+    with deadline(LAYOUT_S, bundle.entry, "give a light map", "Simplify it, or give it a light-map UV (TEXCOORD_1)."):
+        scene = assign_lightmap_uv(scene, settings.lightmap)
+        step(3)
+        texel_map = build_texel_map(scene, settings.lightmap.resolution)
     tiles = plan_tiles(texel_map, settings.lightmap.tile)
     if not tiles:
         raise InputError(
@@ -68,7 +72,7 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         has_environment=scene.environment is not None,
         has_light=scene.has_light,
         triangles=scene.triangles,
-        notes=scene.notes,
+        notes=few_notes(scene.notes),
         seconds=time.perf_counter() - began,
     )
 
@@ -76,6 +80,13 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
 def traces_between(settings: BakeSettings) -> bool:
     """Whether the fit learns from light fields between texels."""
     return settings.fit.solver is Solver.COHERENT and settings.render.between_samples > 0
+
+
+def few_notes(notes: Sequence[str]) -> tuple[str, ...]:
+    """The first notes; a scene of a hundred thousand meshes has as many to tell."""
+    if len(notes) <= MOST_NOTES:
+        return tuple(notes)
+    return (*notes[:MOST_NOTES], f"{len(notes) - MOST_NOTES} more notes are left out.")
 
 
 def _lay_out(bundle: Bundle, context: Context) -> Path:

@@ -1,0 +1,76 @@
+"""Logs of coordinators and workers: lines for people, or one JSON object a line for collectors.
+
+    {"time": "2026-03-01T12:00:00.123Z", "level": "info", "logger": "kiln_service.reaper", "message": "no heartbeat",
+     "job_id": "...", "task_id": "...", "worker_id": "...", "request_id": "..."}
+
+Ids come from `bound`, which holds for everything logged within its block, and from a record's own `extra`.
+"""
+
+import json
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Any, Final
+
+_OF_EVERY_RECORD: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
+
+_bound: ContextVar[dict[str, Any] | None] = ContextVar("lightkiln_log_fields", default=None)
+
+
+class LogFormat(StrEnum):
+    """How a log is written."""
+
+    TEXT = "text"
+    JSON = "json"
+
+
+@contextmanager
+def bound(**fields: Any) -> Iterator[None]:
+    """Put fields (`job_id`, `task_id`, `worker_id`, `request_id`) on every line that is logged within the block."""
+    token = _bound.set((_bound.get() or {}) | fields)
+    try:
+        yield
+    finally:
+        _bound.reset(token)
+
+
+def set_up(form: LogFormat, level: str = "info") -> None:
+    """Log to standard error from now on."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonFormatter() if form is LogFormat.JSON else TextFormatter())
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+
+
+def fields_of(record: logging.LogRecord) -> dict[str, Any]:
+    """What was bound when the record was made, and its own `extra`."""
+    own = {name: value for name, value in vars(record).items() if name not in _OF_EVERY_RECORD}
+    return (_bound.get() or {}) | own
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a record."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as one line."""
+        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        line = {"time": time, "level": record.levelname.lower(), "logger": record.name, "message": record.getMessage()}
+        line |= {name: value for name, value in fields_of(record).items() if name not in line}
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+class TextFormatter(logging.Formatter):
+    """Time, level, logger and message, then the fields."""
+
+    def __init__(self) -> None:
+        super().__init__("%(asctime)s %(levelname)s %(name)s: %(message)s")
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """The line before a traceback."""
+        fields = " ".join(f"{name}={value}" for name, value in fields_of(record).items())
+        return f"{super().formatMessage(record)} {fields}" if fields else super().formatMessage(record)

@@ -1,0 +1,1 @@
+"""Stages for the worker of tests/hostile: the real ones, watched."""
