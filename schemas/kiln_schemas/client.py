@@ -18,6 +18,7 @@ from pydantic import TypeAdapter
 
 from kiln_schemas.errors import AuthError, KilnError, TooMany, Unreachable, error_of_answer, wait_asked
 from kiln_schemas.job import (
+    CurveView,
     JobChange,
     JobPage,
     JobRequest,
@@ -122,6 +123,11 @@ class Client:
         params = {} if kind is None else {"kind": kind.value}
         reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/tasks", params=params)
         return TypeAdapter(tuple[TaskView, ...]).validate_json(reply.content)
+
+    def curves(self, job_id: str) -> tuple[CurveView, ...]:
+        """The losses of a job's fits over their steps."""
+        reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/curves")
+        return TypeAdapter(tuple[CurveView, ...]).validate_json(reply.content)
 
     def act(self, job_id: str, action: Literal["pause", "resume", "cancel", "retry", "archive"]) -> JobView:
         """Ask something of a job."""

@@ -30,6 +30,7 @@ from kiln_service.db.migrate import migrate
 from kiln_service.events import Signals
 from kiln_service.maintenance import Maintenance
 from kiln_service.metrics import RequestSeconds
+from kiln_service.rates import RateLimits
 from kiln_service.webhooks import Deliverer
 from kiln_service.work import Work
 
@@ -57,6 +58,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         return JSONResponse(openapi_document(app))
 
     app.state.request_seconds = RequestSeconds()
+    app.state.rates = RateLimits(config.limits.rates)
     dashboard.install(app)
     problems.install(app, tokens, config.limits, dashboard.error_page)
     return app

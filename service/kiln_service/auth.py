@@ -71,8 +71,8 @@ class TokenBook:
                 remedy="Send `Authorization: Bearer TOKEN` (by default it is in the data folder's file `token`).",
             )
         scheme, _, token = header.partition(" ")
-        bearer = scheme.lower() == "bearer"
-        principal = await self.find(digest_of(token.strip()), database, before_lookup) if bearer else None
+        known = scheme.lower() == "bearer"
+        principal = await self.find(digest_of(token.strip()), database, before_lookup) if known else None
         if principal is None:
             raise AuthError(
                 "the token is not known here",

@@ -5,6 +5,7 @@ Pure ASGI middleware, so that streamed bodies pass through untouched.
 
 import logging
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final
 from urllib.parse import quote
 
@@ -34,7 +35,6 @@ from kiln_service import sessions
 from kiln_service.auth import Principal, TokenBook
 from kiln_service.config import Limits
 from kiln_service.ids import new_id
-from kiln_service.rates import RateLimits
 from kiln_service.requests import Requests
 
 log = logging.getLogger(__name__)
@@ -88,9 +88,8 @@ def answer(request: Request, problem: Problem) -> Response:
 def install(
     app: FastAPI, tokens: TokenBook, limits: Limits, error_page: Callable[[Request, Problem], Response]
 ) -> None:
-    """Handlers for each kind of error, then (outermost last) body bounds, authentication, last resort, headers, log."""
+    """Handlers for every kind of error, then (outermost last) bounds, authentication, last resort, headers, log."""
     app.state.error_page = error_page
-    app.state.rates = RateLimits(limits.rates)
     app.add_exception_handler(KilnError, _kiln_error)
     app.add_exception_handler(RequestValidationError, _invalid_request)
     app.add_exception_handler(HTTPException, _http_error)
@@ -99,7 +98,7 @@ def install(
     app.add_exception_handler(psycopg.DataError, _not_storable)
     app.add_exception_handler(ClientDisconnect, _gone)
     app.add_middleware(BoundedBody, limit=limits.body_bytes)
-    app.add_middleware(Authentication, tokens=tokens, rates=app.state.rates)
+    app.add_middleware(Authentication, tokens=tokens)
     app.add_middleware(LastResort)
     app.add_middleware(SecurityHeaders)
     app.add_middleware(Requests)
@@ -225,17 +224,18 @@ class Authentication:
     `scope["session"]` is the cookie's value where the caller is known by it.
     """
 
-    def __init__(self, app: ASGIApp, tokens: TokenBook, rates: RateLimits) -> None:
-        self._app, self._tokens, self._rates = app, tokens, rates
+    def __init__(self, app: ASGIApp, tokens: TokenBook) -> None:
+        self._app, self._tokens = app, tokens
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http" and not is_open(scope["path"]):
             request = Request(scope)
             try:
-                scope["principal"] = await self._caller(request)
-                self._rates.count(scope["principal"].name, scope["path"])
+                scope["principal"] = await self._who(request)
+                request.app.state.rates.count(scope["principal"].name, scope["path"])
             except AuthError as error:
-                await (_sign_in_first(request) or problem_response(error.problem()))(scope, receive, send)
+                response = _sign_in_first(request) or problem_response(error.problem())
+                await response(scope, receive, send)
                 return
             except KilnError as error:
                 response = answer(request, error.problem())
@@ -248,30 +248,27 @@ class Authentication:
                 return
         await self._app(scope, receive, send)
 
-    async def _caller(self, request: Request) -> Principal:
-        """Who calls, by bearer token or, on pages and where nothing is changed, by the cookie of a session.
-
-        An address that failed too often is refused before a token is looked up in the database.
-        """
-        header, cookie = request.headers.get("authorization"), sessions.read_cookie(request.headers)
-        address = client_address(request)
-        database = request.app.state.parts.database
+    async def _who(self, request: Request) -> Principal:
+        """The caller by bearer token or, on pages and where nothing is changed, by the cookie of a session."""
+        database, header = request.app.state.parts.database, request.headers.get("authorization")
+        cookie = sessions.read_cookie(request.headers)
         safe = request.method in sessions.SAFE_METHODS
+        if header is not None or cookie is None or not (safe or is_page(request.url.path)):
+            return await self._by_token(request, header)
+        if not safe:
+            sessions.check_origin(request.headers)
+        request.scope["session"] = cookie
+        return await sessions.principal_of(database, self._tokens, cookie)
+
+    async def _by_token(self, request: Request, header: str | None) -> Principal:
+        """An address that failed too often is refused before a token is looked up in the database."""
+        state, address = request.app.state, request.client.host if request.client else ""
+        may_sign_in = partial(state.rates.may_sign_in, address)
         try:
-            if header is not None or cookie is None or not (safe or is_page(request.url.path)):
-                return await self._tokens.authenticate(header, database, lambda: self._rates.may_sign_in(address))
-            if not safe:
-                sessions.check_origin(request.headers)
-            request.scope["session"] = cookie
-            return await sessions.principal_of(database, self._tokens, cookie)
+            return await self._tokens.authenticate(header, state.parts.database, before_lookup=may_sign_in)
         except AuthError:
-            self._rates.failed(address)
+            state.rates.failed(address)
             raise
-
-
-def client_address(request: Request) -> str:
-    """Whose failures to sign in are counted together."""
-    return request.client.host if request.client else ""
 
 
 def _sign_in_first(request: Request) -> Response | None:

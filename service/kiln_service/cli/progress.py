@@ -1,9 +1,10 @@
-"""One progress display for a job: a bar a stage on a terminal, a line now and then elsewhere; and following a job."""
+"""One progress display for a job: bars, tiles and curves on a terminal, lines elsewhere; and following a job."""
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Final, Protocol, Self
 
@@ -15,21 +16,38 @@ from rich.text import Text
 
 from kiln_schemas.client import Client
 from kiln_schemas.errors import Unreachable
-from kiln_schemas.job import JobView, StageView, TaskView
-from kiln_schemas.states import FINAL_JOB_STATES
+from kiln_schemas.job import CurveView, JobView, StageView, TaskView
+from kiln_schemas.states import FINAL_JOB_STATES, TaskState
 from kiln_schemas.tasks import TaskKind
 from kiln_service.cli.output import duration, notices
+from kiln_service.cli.tile_map import draw_grid, legend, sparkline, tile_grid
 
 POLL_S: Final = 0.5
+MOST_CELLS: Final = 64
+"""Of a side of the tile map."""
+CURVE_WIDTH: Final = 64
 LINE_S: Final = 10.0
 """Between two lines where there is no terminal."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What a terminal shows of a job beside its stages."""
+
+    tiles: Sequence[TaskView] = ()
+    """Its render tasks, once there are some."""
+    curves: Sequence[CurveView] = ()
+    """The losses of its fits, once there are some."""
 
 
 class Display(AbstractContextManager["Display"], Protocol):
     """Something that shows how far a job is."""
 
-    def show(self, job: JobView, fits: Sequence[TaskView]) -> None:
-        """Show this state; `fits` are the fit tasks once there are some."""
+    pictures: bool
+    """Whether it shows tiles; they are not asked for otherwise."""
+
+    def show(self, job: JobView, seen: Pictures) -> None:
+        """Show this state."""
 
     def say(self, message: str) -> None:
         """Show a notice that stays."""
@@ -43,7 +61,9 @@ def make_display(*, quiet: bool = False) -> Display:
 
 
 class BarDisplay:
-    """A live table of bars with tiles, loss, time left and elapsed."""
+    """A live table of bars with time left and elapsed, the light map tile by tile, and the losses over the steps."""
+
+    pictures = True
 
     def __init__(self) -> None:
         self._began = time.monotonic()
@@ -58,15 +78,27 @@ class BarDisplay:
     ) -> None:
         self._live.stop()
 
-    def show(self, job: JobView, fits: Sequence[TaskView]) -> None:
+    def show(self, job: JobView, seen: Pictures) -> None:
         table = Table.grid(padding=(0, 2))
         for stage in job.stages:
             bar = ProgressBar(total=1.0, completed=stage.fraction, width=32)
-            table.add_row(stage.kind.value, bar, f"{stage.fraction:4.0%}", counts(stage), details(stage, fits))
+            table.add_row(stage.kind.value, bar, f"{stage.fraction:4.0%}", counts(stage), details(stage, seen.curves))
         head = f"{job.name}: {job.state.value}, elapsed {duration(time.monotonic() - self._began)}"
         if job.remaining_s is not None and job.state not in FINAL_JOB_STATES:
             head += f", about {duration(job.remaining_s)} left"
-        self._live.update(Group(Text(head), table))
+        self._live.update(Group(Text(head), table, *self._drawn(job, seen)))
+
+    def _drawn(self, job: JobView, seen: Pictures) -> Iterator[Text]:
+        size = self._live.console.size
+        if seen.tiles and any(tile.state is not TaskState.COMPLETED for tile in seen.tiles):
+            lightmap = job.settings.lightmap
+            room = max(2 * (size.height - len(job.stages) - len(seen.curves) - 4), 2)
+            grid = tile_grid(seen.tiles, lightmap.resolution, lightmap.tile, min(size.width - 1, room, MOST_CELLS))
+            yield draw_grid(grid)
+            yield legend(grid)
+        for curve in seen.curves:
+            if line := sparkline(curve, min(size.width - 24, CURVE_WIDTH)):
+                yield Text(f"{curve.label:12} {line} {curve.points[-1][1]:.4g}")
 
     def say(self, message: str) -> None:
         self._live.console.print(message, markup=False)
@@ -74,6 +106,8 @@ class BarDisplay:
 
 class LineDisplay:
     """A line whenever a stage changes its number of finished tasks, but not more often than `every_s` otherwise."""
+
+    pictures = False
 
     def __init__(self, every_s: float) -> None:
         self._every_s, self._last, self._stages = every_s, float("-inf"), ""
@@ -87,13 +121,13 @@ class LineDisplay:
     ) -> None:
         return None
 
-    def show(self, job: JobView, fits: Sequence[TaskView]) -> None:
+    def show(self, job: JobView, seen: Pictures) -> None:
         active = ",".join(stage.kind.value for stage in job.stages if 0 < stage.fraction < 1)
         now = time.monotonic()
         if self._every_s == float("inf") or (now - self._last < self._every_s and active == self._stages):
             return
         self._last, self._stages = now, active
-        words = [f"{s.kind.value} {s.fraction:.0%} {counts(s)} {details(s, fits)}".strip() for s in job.stages]
+        words = [f"{s.kind.value} {s.fraction:.0%} {counts(s)} {details(s, seen.curves)}".strip() for s in job.stages]
         left = "" if job.remaining_s is None else f", about {duration(job.remaining_s)} left"
         self.say(f"[{duration(now - self._began)}] {job.state.value}: {'; '.join(words)}{left}")
 
@@ -104,15 +138,29 @@ class LineDisplay:
 def counts(stage: StageView) -> str:
     """Finished and planned tasks in their own word."""
     word = {TaskKind.RENDER: "tiles", TaskKind.REFINE: "blocks"}.get(stage.kind, "tasks")
-    return f"{stage.completed}/{stage.total} {word}"
+    failed = f", {stage.failed} failed" if stage.failed else ""
+    return f"{stage.completed}/{stage.total} {word}{failed}"
 
 
-def details(stage: StageView, fits: Sequence[TaskView]) -> str:
+def details(stage: StageView, curves: Sequence[CurveView]) -> str:
     """The loss of each network that is being fitted."""
     if stage.kind is not TaskKind.FIT:
         return ""
-    losses = [(t.label, t.progress.loss) for t in fits if t.progress is not None and t.progress.loss is not None]
-    return ", ".join(f"{label} loss {loss:.4g}" for label, loss in losses)
+    running = [curve for curve in curves if curve.points and curve.state is TaskState.ACTIVE]
+    return ", ".join(f"{curve.label} loss {curve.points[-1][1]:.4g}" for curve in running)
+
+
+def look(api: Client, job: JobView, seen: Pictures, *, tiles: bool) -> Pictures:
+    """What there is to see of a job now, asked for only where something happens."""
+    stages = {stage.kind: stage for stage in job.stages}
+    render, fit = stages.get(TaskKind.RENDER), stages.get(TaskKind.FIT)
+    if tiles and render is not None and (not seen.tiles or render.completed < render.total):
+        seen = replace(seen, tiles=api.tasks(job.id, TaskKind.RENDER))
+    elif render is not None and render.completed == render.total:
+        seen = replace(seen, tiles=())
+    if fit is not None and (fit.active or (fit.completed and not seen.curves)):
+        seen = replace(seen, curves=api.curves(job.id))
+    return seen
 
 
 def follow(
@@ -125,16 +173,16 @@ def follow(
 ) -> JobView:
     """Show a job until it is over; `between` runs at every look, and with it an outage is waited out."""
     before: JobView | None = None
+    seen = Pictures()
     while True:
         try:
             job = api.job(job_id)
-            fitting = any(stage.kind is TaskKind.FIT and stage.active for stage in job.stages)
-            fits = api.tasks(job_id, TaskKind.FIT) if fitting else ()
+            seen = look(api, job, seen, tiles=display.pictures)
         except Unreachable:
             if between is None:
                 raise
         else:
-            display.show(job, fits)
+            display.show(job, seen)
             if on_change is not None and job != before:
                 on_change(job)
             before = job

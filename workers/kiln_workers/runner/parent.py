@@ -54,6 +54,8 @@ FAREWELL_S: Final = 3.0
 """How long a worker that is told to stop tries to give its task back."""
 PAUSE_MAX_S: Final = 30.0
 LOG_CHARACTERS: Final = 65536
+LAST_LINES: Final = 8
+"""Of a dead child's, quoted in its task's error."""
 
 Announce = Callable[[str, dict[str, Any]], None]
 """Told what happens: an event's name (`task.claimed`, `log`, ...) and its details."""
@@ -249,7 +251,7 @@ class Worker:
             case Failed(problem=problem, retryable=retryable) if problem.code != StaleAttempt.code:
                 self._fail(claim, KilnError.from_problem(problem), retryable)
             case Ended():
-                self._fail(claim, _death(outcome), True)
+                self._fail(claim, self._death(outcome), True)
             case _:
                 self._announce("task.left", _names(claim))
 
@@ -281,6 +283,14 @@ class Worker:
     def _failure(self, claim: Claim, error: KilnError, retryable: bool) -> Failure:
         tail = "\n".join(self._child.tail) if self._child else ""
         return Failure(attempt=claim.attempt, problem=error.problem(), retryable=retryable, log=tail[-LOG_CHARACTERS:])
+
+    def _death(self, ended: Ended) -> KilnError:
+        """Why the child ended, with the last lines that it wrote."""
+        lines = [line for line in (self._child.tail if self._child else ()) if line.strip()][-LAST_LINES:]
+        detail = f"{ended.sentence()}. Its last lines: {' | '.join(lines)}" if lines else ended.sentence()
+        if ended.status == -signal.SIGKILL:
+            return MachineLacks(detail, remedy="Start the worker with a smaller --memory.")
+        return InternalError(detail, remedy="Please report it with the task's log.")
 
     def _hear_line(self, line: str) -> None:
         self._lines.add(line)
@@ -330,12 +340,6 @@ class LineBuffer:
         with self._lock:
             text, self._text = self._text, ""
         return text
-
-
-def _death(ended: Ended) -> KilnError:
-    if ended.status == -signal.SIGKILL:
-        return MachineLacks(ended.sentence(), remedy="Start the worker with a smaller --memory.")
-    return InternalError(ended.sentence(), remedy="Please report it with the task's log.")
 
 
 def _names(claim: Claim) -> dict[str, Any]:

@@ -12,7 +12,7 @@ const KINDS = [
     .split(" ").map((kind) => `job.${kind}`),
   ..."queued claimed completed failed soft-failed canceled retried lost released requeued".split(" ").map((kind) => `task.${kind}`),
   ..."planned queued canceled reused reopened requeued".split(" ").map((kind) => `tasks.${kind}`),
-  "stage.completed",
+  "stage.completed", "worker.blocked",
 ];
 
 let woken = false;
