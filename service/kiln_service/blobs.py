@@ -116,9 +116,10 @@ class Blobs:
 
     async def read_parts(self, sha256: str, starts: Sequence[int], length: int) -> list[bytes]:
         """So many bytes of a blob from each of these places on."""
-        parts = await obstore.get_ranges_async(
-            self._objects, _key(sha256), starts=starts, lengths=[length] * len(starts), coalesce=READ_GAP
-        )
+        with _storage_errors():
+            parts = await obstore.get_ranges_async(
+                self._objects, _key(sha256), starts=starts, lengths=[length] * len(starts), coalesce=READ_GAP
+            )
         return [bytes(part) for part in parts]
 
     async def take(self, body: AsyncIterator[bytes]) -> str:

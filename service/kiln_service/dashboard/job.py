@@ -1,17 +1,19 @@
 """A job's page, what may be done to the job, and the pages of its tasks with their logs."""
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Set
 from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import Response
+from psycopg.rows import DictRow
 
-from kiln_schemas.errors import InputError, NotFound
-from kiln_schemas.job import EventView, JobChange, JobView
+from kiln_schemas.errors import Conflict, InputError, NotFound
+from kiln_schemas.job import EventView, JobChange, JobView, RequeueRequest
 from kiln_schemas.operators import Scope
-from kiln_schemas.states import FINAL_JOB_STATES, JOB_TRANSITIONS, JobState
+from kiln_schemas.states import FINAL_JOB_STATES, LIVE_JOB_STATES, OVER_TASK_STATES, PUBLISHED_JOB_STATES, JobState
+from kiln_schemas.tasks import TaskKind
 from kiln_service import jobs, views
-from kiln_service.api.common import PartsHere, caller
+from kiln_service.api.common import Parts, PartsHere, caller
 from kiln_service.auth import Principal
 from kiln_service.dashboard.jobs import stretch
 from kiln_service.dashboard.pages import Form, page, see
@@ -25,6 +27,8 @@ Submitter = Annotated[Principal, Depends(caller(Scope.SUBMIT))]
 EVENTS: Final = 100
 TASKS: Final = 200
 """Most that a job's page lists."""
+LOG_LINES: Final = 2000
+"""Of a log the page shows so many of the last lines."""
 
 Action = Literal["pause", "resume", "cancel", "retry", "archive"]
 _DO: Final[Mapping[Action, Callable[[Database, str, str], Awaitable[None]]]] = {
@@ -34,22 +38,26 @@ _DO: Final[Mapping[Action, Callable[[Database, str, str], Awaitable[None]]]] = {
     "retry": jobs.retry,
     "archive": jobs.archive,
 }
-_ACTIONS: Final[Mapping[Action, tuple[JobState, str, str]]] = {
+_ACTIONS: Final[Mapping[Action, tuple[Set[JobState], str, str]]] = {
     "pause": (
-        JobState.PAUSED,
+        {JobState.QUEUED, JobState.ACTIVE},
         "Pause",
         "Its running tasks go on to their end; no other is given to a worker.",
     ),
-    "resume": (JobState.QUEUED, "Resume", "Its tasks are given to workers again."),
-    "cancel": (
-        JobState.CANCEL_REQUESTED,
-        "Cancel",
-        "Its running tasks are stopped. What has completed stays for a retry.",
+    "resume": ({JobState.PAUSED}, "Resume", "Its tasks are given to workers again."),
+    "cancel": (LIVE_JOB_STATES, "Cancel", "Its running tasks are stopped; what has completed stays."),
+    "retry": (
+        {JobState.FAILED, JobState.CANCELED},
+        "Retry",
+        "Its unfinished tasks are done again; what has completed stays.",
     ),
-    "retry": (JobState.QUEUED, "Retry", "Its unfinished tasks are done again; what has completed stays."),
-    "archive": (JobState.ARCHIVED, "Archive", "Lists leave it out from now on. Its package stays."),
+    "archive": (
+        FINAL_JOB_STATES - {JobState.ARCHIVED},
+        "Archive",
+        "Lists leave it out from now on. Its package stays.",
+    ),
 }
-"""Where each leads, its name, and what it does, for the question before it is done."""
+"""In which states each is offered, its name, and what it does, for the question before it is done."""
 
 
 @router.get("/jobs/{job_id}", dependencies=[Reader])
@@ -93,17 +101,46 @@ async def act(job_id: str, action: Action, parts: PartsHere, who: Submitter, _: 
 @router.get("/tasks/{task_id}", dependencies=[Reader])
 async def task(request: Request, task_id: str, parts: PartsHere) -> Response:
     """One task and its log, which a script follows while it runs."""
+    row = await _task(parts, task_id)
+    view = views.task_view(TaskRow.of(row), row["worker"])
+    return page(
+        request,
+        "task.html",
+        task=view,
+        job_id=row["job_id"],
+        log=await views.task_log(parts.database, task_id, LOG_LINES),
+        lines=LOG_LINES,
+        over=view.state in OVER_TASK_STATES,
+        may_redo=view.state in OVER_TASK_STATES
+        and view.kind is not TaskKind.PREPARE
+        and JobState(row["job_state"]) in LIVE_JOB_STATES | PUBLISHED_JOB_STATES,
+    )
+
+
+@router.post("/tasks/{task_id}/requeue")
+async def redo(task_id: str, parts: PartsHere, who: Submitter, _: Form) -> Response:
+    """Do a task again, and what follows from it."""
+    row = await _task(parts, task_id)
+    if row["kind"] == TaskKind.PREPARE:
+        raise Conflict("a scene is prepared once", where=row["label"], remedy="Submit the job again.")
+    wanted = RequeueRequest(kind=row["kind"], labels=(row["label"],))
+    await jobs.requeue(parts.database, row["job_id"], wanted, who.actor)
+    return see(f"/tasks/{task_id}")
+
+
+async def _task(parts: Parts, task_id: str) -> DictRow:
     async with parts.database.transaction() as tx:
         row = await tx.maybe("one_task", id=task_id)
     if row is None:
         raise NotFound(f"no task '{task_id}'", where="task")
-    view = views.task_view(TaskRow.of(row), row["worker"])
-    log = await views.task_log(parts.database, task_id)
-    return page(request, "task.html", task=view, job_id=row["job_id"], log=log)
+    return row
 
 
 def _allowed(view: JobView) -> list[tuple[Action, str, str]]:
-    """What may be done to the job as it is."""
-    allowed = {action for action, (after, _, _) in _ACTIONS.items() if after in JOB_TRANSITIONS[view.state]}
-    allowed -= {"retry"} if view.state is JobState.PAUSED else {"resume"}
-    return [(action, name, does) for action, (_, name, does) in _ACTIONS.items() if action in allowed]
+    """What may be done to the job as it is; to retry also where it goes on without tasks that failed."""
+    failed = view.state in LIVE_JOB_STATES and any(stage.failed for stage in view.stages)
+    return [
+        (action, name, does)
+        for action, (states, name, does) in _ACTIONS.items()
+        if view.state in states or (action == "retry" and failed)
+    ]

@@ -85,6 +85,7 @@ def stretch(stage: StageView, place: int = 0) -> list[Part]:
         "completed": stage.completed / stage.total,
         "active": max(stage.fraction - stage.completed / stage.total, 0.0),
         "failed": stage.failed / stage.total,
+        "soft-failed": stage.soft_failed / stage.total,
     }
     parts, start = [], place * WIDTH
     for state, share in shares.items():

@@ -40,3 +40,12 @@ async def tell_worker(
     """Tell a worker to sleep, to wake or to leave."""
     await operators.order_worker(parts.database, worker_id, order, who.actor)
     return see("/workers")
+
+
+@router.post("/workers/{worker_id}/unblock")
+async def unblock(
+    worker_id: str, parts: PartsHere, who: Annotated[Principal, Depends(caller(Scope.ADMIN))], _: Form
+) -> Response:
+    """Let a worker take tasks of all jobs again."""
+    await operators.unblock_worker(parts.database, worker_id, who.actor)
+    return see("/workers")

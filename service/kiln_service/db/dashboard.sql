@@ -21,9 +21,9 @@ WHERE job_id = %(job_id)s
 ORDER BY ordinal LIMIT %(limit)s;
 
 -- name: one_task
--- A task with its worker's name.
-SELECT tasks.*, workers.name AS worker
-FROM tasks LEFT JOIN workers ON workers.id = tasks.worker_id WHERE tasks.id = %(id)s;
+-- A task with its worker's name and its job's state.
+SELECT tasks.*, workers.name AS worker, jobs.state AS job_state
+FROM tasks JOIN jobs ON jobs.id = tasks.job_id LEFT JOIN workers ON workers.id = tasks.worker_id WHERE tasks.id = %(id)s;
 
 -- name: last_events
 -- The newest events of a job.

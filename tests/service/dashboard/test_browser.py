@@ -143,6 +143,19 @@ def test_progress_comes_by_itself_and_the_reader_keeps_the_place(home, dashboard
     screenshot(page, "job-live")
 
 
+def test_a_tile_that_failed_once_stands_out(home, dashboard, known_bake):
+    job = home.submit()["id"]
+    bake, worker = known_bake(job), home.worker()
+    worker.finish(worker.must_claim(), tiles=4, texel_map=bake.texel_map)
+    worker.fail(worker.must_claim("render"))
+    page = dashboard.open(f"/jobs/{job}")
+    expect(page.locator("#atlas-note")).to_contain_text("4 tiles: 3 queued, 1 soft-failed")
+    expect(page.locator(".stages")).to_contain_text("0 +1")
+    expect(page.locator("#tasks")).to_contain_text("soft-failed")
+    red, green, blue, _ = texel_of_map(page, 2, 2)
+    assert red > green > blue  # orange
+
+
 def test_losses_and_the_log_are_followed_while_a_fit_runs(home, dashboard, known_bake):
     job = home.submit()["id"]
     bake, worker = known_bake(job), home.worker()
@@ -164,7 +177,7 @@ def test_losses_and_the_log_are_followed_while_a_fit_runs(home, dashboard, known
     assert page.get_by_role("log").evaluate(end)
 
 
-def test_a_clicked_texel_shows_what_was_rendered_and_what_the_lobes_make_of_it(dashboard, baked, screenshot, axe):
+def test_a_clicked_texel_shows_what_was_rendered_and_what_the_lobes_make_of_it(home, dashboard, baked, screenshot, axe):
     job, bake = baked
     page = dashboard.open(f"/jobs/{job}")
     expect(page.locator("#atlas-note")).to_contain_text("Irradiance of 4 tiles")
@@ -200,6 +213,14 @@ def test_a_clicked_texel_shows_what_was_rendered_and_what_the_lobes_make_of_it(d
     screenshot(page, "job-completed")
     page.get_by_role("link", name=re.compile("0, 8")).click()
     expect(page.get_by_role("heading", name="render tile 0,8")).to_be_visible()
+    # The tile is done again: its light and the package are gone until then.
+    page.get_by_role("button", name="Do again…").click()
+    page.get_by_role("button", name="Do the task again").click()
+    expect(page.locator(".head .chip").first).to_have_text("queued")
+    page.goto(f"{dashboard.url}/jobs/{job}")
+    expect(page.locator("#atlas-note")).to_contain_text("4 tiles: 1 queued, 3 completed. Irradiance of 3 tiles.")
+    expect(page.get_by_label("error")).to_be_disabled()
+    assert home.events(job)[-2]["detail"]["labels"] == ["tile 0,8"] and home.job(job)["state"] == "queued"
 
 
 def test_artifacts_are_downloaded_as_they_are_and_a_report_runs_nothing(dashboard, baked, tmp_path: Path):
@@ -295,15 +316,23 @@ def test_workers_are_seen_and_told_and_stuck_tasks_stand_out(home, dashboard, sc
     )
     expect(page.locator("#stuck")).to_contain_text("prepare scene")
     expect(page.locator("#stuck")).to_contain_text("6 min")
+    home.sql("UPDATE workers SET tags = '{gpu,large}' WHERE id = %s", idle.id)
+    home.sql("INSERT INTO blocks VALUES ('node-2', %s, 'render', now() + interval '1 hour')", job)
+    expect(page.locator(f"#worker-{idle.id}")).to_contain_text("gpu large")
+    expect(page.locator(f"#worker-{idle.id}")).to_contain_text("no render of a job until")
     assert axe(page) == []
     screenshot(page, "workers")
+    page.get_by_role("button", name="Unblock node-2").click()
+    page.get_by_role("button", name="Unblock the worker").click()
+    expect(page.locator(f"#worker-{idle.id}")).not_to_contain_text("no render of")
     page.get_by_role("button", name="Sleep node-2").click()
     page.get_by_role("button", name="Sleep the worker").click()
     expect(page.locator(f"#worker-{idle.id}")).to_contain_text("asleep")
     page.get_by_role("button", name="Wake node-2").click()
     page.get_by_role("button", name="Wake the worker").click()
     expect(page.locator(f"#worker-{idle.id}")).to_contain_text("awake")
-    assert [entry["action"] for entry in home.client.get("/v1/audit").json()][:2] == ["worker.wake", "worker.sleep"]
+    done = [entry["action"] for entry in home.client.get("/v1/audit").json()]
+    assert done[:3] == ["worker.wake", "worker.sleep", "worker.unblocked"]
     assert home.job(job)["state"] == "active"
 
 

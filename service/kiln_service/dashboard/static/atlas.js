@@ -92,7 +92,7 @@ export class Atlas {
     if (!this.texels) await this.readTexels();
     this.draw();
     await this.readLight();
-    if (!this.error) await this.readError();
+    await this.readError();
   }
 
   async readTexels() {
@@ -102,6 +102,7 @@ export class Atlas {
 
   async readLight() {
     const done = this.states.indexOf("completed");
+    for (const [r, c, , state] of this.tiles) if (state !== done) this.light.delete(`${r},${c}`); // is done again
     const missing = this.tiles.filter(([r, c, , state]) => state === done && !this.light.has(`${r},${c}`));
     const side = this.tile / this.stride, floats = 3 * side * side;
     const atOnce = Math.min(Math.max(Math.floor(BYTES / (4 * floats)), 16), MOST_TILES);
@@ -124,12 +125,15 @@ export class Atlas {
     if (missing.length) this.draw();
   }
 
+  // The package's errors, as long as there is a package: tasks that are done again take it away.
   async readError() {
-    if (!document.querySelector('#artifacts a[href$="/errors.ktx2"]')) return;
-    const reply = await fetch(`/v1/jobs/${this.job}/artifacts/errors.ktx2`);
-    if (!reply.ok) return;
-    this.error = readKtx2(await reply.arrayBuffer());
-    document.querySelector("input[name=layer][value=error]").disabled = false;
+    const link = document.querySelector('#artifacts a[href$="/errors.ktx2"]');
+    const sha256 = link?.closest("tr").querySelector(".hash span").title;
+    if (sha256 === this.error?.sha256) return;
+    const reply = link ? await fetch(link.href) : null;
+    this.error = reply?.ok ? { sha256, ...readKtx2(await reply.arrayBuffer()) } : null;
+    document.querySelector("input[name=layer][value=error]").disabled = !this.error;
+    if (this.layer === "error") this.draw();
   }
 
   draw() {

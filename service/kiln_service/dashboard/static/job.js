@@ -11,7 +11,8 @@ const KINDS = [
   ..."created active paused resumed changed completed gate-failed failed cancel-requested canceled archived queued"
     .split(" ").map((kind) => `job.${kind}`),
   ..."queued claimed completed failed soft-failed canceled retried lost released requeued".split(" ").map((kind) => `task.${kind}`),
-  "stage.completed", "tasks.planned", "tasks.queued", "tasks.reopened", "tasks.requeued", "tasks.canceled", "worker.blocked", "message",
+  ..."planned queued canceled reused reopened requeued".split(" ").map((kind) => `tasks.${kind}`),
+  "stage.completed", "worker.blocked",
 ];
 
 let woken = false;

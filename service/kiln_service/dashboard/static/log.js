@@ -1,6 +1,4 @@
-// Follow a task's log while the task is not over: read it again every two seconds, and stay at its end unless the reader
-// has scrolled up.
-const OVER = new Set(["completed", "failed", "canceled"]);
+// Follow a task's log as it is written, and stay at its end unless the reader has scrolled up.
 const log = document.getElementById("log");
 const follow = document.getElementById("follow");
 const task = () => document.getElementById("task").dataset;
@@ -9,27 +7,41 @@ function toEnd() {
   if (follow.checked) log.scrollTop = log.scrollHeight;
 }
 
-async function read() {
-  const reply = await fetch(`/v1/tasks/${task().task}/log`, { headers: { Accept: "text/plain" } });
+// One stream: the last lines so far, then what comes, until the task is over or the tab is left.
+async function read(signal) {
+  const { task: id, lines } = task();
+  const reply = await fetch(`/v1/tasks/${id}/log?follow=true&tail=${lines}`, { signal });
   if (!reply.ok) return;
-  const text = await reply.text();
-  if (text === log.textContent) return;
-  if (text.startsWith(log.textContent)) log.append(text.slice(log.textContent.length));
-  else log.textContent = text;
-  toEnd();
+  const reader = reply.body.pipeThrough(new TextDecoderStream()).getReader();
+  let first = true;
+  for (let part = await reader.read(); !part.done; part = await reader.read()) {
+    if (first) log.textContent = part.value;
+    else log.append(part.value);
+    first = false;
+    toEnd();
+  }
 }
 
 log.addEventListener("scroll", () => {
-  const atEnd = log.scrollHeight - log.scrollTop - log.clientHeight < 24;
-  if (!atEnd) follow.checked = false;
+  if (log.scrollHeight - log.scrollTop - log.clientHeight >= 24) follow.checked = false;
 });
 follow.addEventListener("change", toEnd);
 toEnd();
 
-let last = "";
-setInterval(() => {
-  const state = task().state;
-  if (document.hidden || (OVER.has(state) && OVER.has(last))) return;
-  last = state;
-  read().catch(() => {});
-}, 2000);
+// A browser has six connections to a host in all its tabs: only the tab that is looked at keeps one.
+let stream = null;
+
+async function keepReading() {
+  if (stream || document.hidden || task().over === "true") return;
+  stream = new AbortController();
+  try {
+    await read(stream.signal);
+  } catch {
+    // The coordinator went away, or the tab was left: begin anew below.
+  }
+  stream = null;
+}
+
+document.addEventListener("visibilitychange", () => document.hidden && stream?.abort());
+setInterval(keepReading, 2000);
+keepReading();
