@@ -119,6 +119,7 @@ def test_the_coordinators_image_has_no_renderer_and_serves(install, tmp_path):
     ((_, entry),) = [step for step in instructions(ROOT / "docker/coordinator.Dockerfile") if step[0] == "ENTRYPOINT"]
     command = [word.replace("/var/lib/lightkiln", f"{install.parent}/data") for word in json.loads(entry)]
     command = ["127.0.0.1" if word == "0.0.0.0" else "0" if word == "8321" else word for word in command]
+    command += ["--storage", f"file://{install.parent}/storage", "--log-format", "json"]
     path = {"PATH": f"{install / 'bin'}:/usr/bin:/bin"}
     with subprocess.Popen([*command, "--json"], stdout=subprocess.PIPE, text=True, env=path) as coordinator:
         ready = json.loads(coordinator.stdout.readline())
@@ -128,4 +129,4 @@ def test_the_coordinators_image_has_no_renderer_and_serves(install, tmp_path):
         healthy = subprocess.run(check, env=path, capture_output=True, text=True)
         coordinator.terminate()
     assert healthy.returncode == 0, healthy.stderr
-    assert coordinator.returncode == 0
+    assert coordinator.returncode == 0 and (install.parent / "storage/blobs").is_dir()

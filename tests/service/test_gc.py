@@ -142,7 +142,8 @@ def test_without_rules_nothing_goes(start, eventually):
         archive(home, baked(home, set=["render.samples=9"]))
     with start(retention=Retention(check_s=0.05)) as home:
         unused = home.sql("SELECT count(*) AS freed FROM jobs WHERE freed IS NOT NULL")
-        lead = "SELECT objid FROM pg_locks WHERE locktype = 'advisory'"
+        lead = "SELECT pid FROM pg_locks JOIN pg_stat_activity USING (pid) WHERE locktype = 'advisory'"
+        lead += " AND datname = current_database()"
         eventually(lambda: home.sql(lead))
         home.worker().claim(wait_s=1)
         assert unused == [{"freed": 0}] and home.job(job)["state"] == "completed"

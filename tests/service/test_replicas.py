@@ -22,7 +22,7 @@ TOKEN = "the-same-at-every-coordinator"
 TIMING = {"heartbeat_s": 0.2, "stale_s": 2, "poll_s": 0.1, "maintenance_s": 0.2}
 LEADERS = """
     SELECT activity.application_name AS name FROM pg_locks JOIN pg_stat_activity AS activity USING (pid)
-    WHERE locktype = 'advisory' AND classid = %s AND objid = %s AND granted
+    WHERE locktype = 'advisory' AND classid = %s AND objid = %s AND granted AND datname = current_database()
 """
 
 
