@@ -142,11 +142,16 @@ class Blobs:
         return collected
 
     async def _collect_one(self, sha256: str, grace_s: float) -> int:
+        """The row first: cut off in between, an object is left that nothing vouches for, and never the reverse."""
         async with self._database.transaction() as tx:
             await tx.run("lock_blob", sha256=sha256)
             deleted = await tx.run("delete_unused_blob", sha256=sha256, seconds=grace_s)
-            if deleted:
-                await obstore.delete_async(self._objects, _key(sha256))
+        if deleted:
+            async with self._database.transaction() as tx:
+                await tx.run("lock_blob", sha256=sha256)
+                if await tx.maybe("find_blob", sha256=sha256) is None:  # else it was uploaded again just now
+                    with _storage_errors():
+                        await obstore.delete_async(self._objects, _key(sha256))
         return deleted
 
     async def check(self) -> None:

@@ -91,6 +91,21 @@ def test_a_lost_object_is_a_sentence(start, bucket):
         assert lost.status_code == 404 and "has lost" in lost.json()["detail"] and "backup" in lost.json()["remedy"]
 
 
+def test_a_collection_that_is_cut_off_leaves_no_row_without_its_object(start, bucket, server, monkeypatch, eventually):
+    with start(storage_url=bucket.url) as home:
+        sha256 = home.upload(b"nobody wants me")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{seaweed.free_ports(1)[0]}")
+    timing = Timing(poll_s=0.1, maintenance_s=0.1, stale_s=600, blob_grace_s=0.3)
+    with start(storage_url=bucket.url, timing=timing) as home:
+        eventually(lambda: home.sql("SELECT count(*) AS n FROM blobs") == [{"n": 0}])
+    monkeypatch.setenv("AWS_ENDPOINT_URL", server.endpoint)
+    with start(storage_url=bucket.url) as home:
+        assert bucket.keys() == [f"blobs/{sha256[:2]}/{sha256}"], "the object could not be deleted"
+        assert home.client.get(f"/v1/blobs/{sha256}").status_code == 404
+        assert home.upload(b"nobody wants me") == sha256
+        assert home.client.get(f"/v1/blobs/{sha256}").content == b"nobody wants me"
+
+
 def test_a_server_that_is_away_is_503(start, bucket, monkeypatch):
     with start(storage_url=bucket.url) as home:
         sha256 = home.upload(b"there")
