@@ -111,6 +111,8 @@ class JobView(Contract):
     priority: int = DEFAULT_PRIORITY
     labels: dict[str, str] = Field(default_factory=dict)
     tags: tuple[str, ...] = ()
+    outcome: JobState | None = None
+    """How it ended, also when it is archived; None before."""
     submitter: str | None = None
     """Name of the token it was submitted with."""
     renders_of: str | None = None

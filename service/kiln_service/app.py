@@ -6,6 +6,7 @@ coordinators may serve the same ones, and one that is killed loses nothing that 
 
 import asyncio
 import contextlib
+import functools
 from collections.abc import AsyncIterator
 
 from fastapi import Depends, FastAPI
@@ -52,10 +53,12 @@ def create_app(config: ServiceConfig) -> FastAPI:
     for module in (job_routes, blob_routes, worker_routes, operator_routes, health_routes):
         app.include_router(module.router)
 
+    document = functools.cache(lambda: openapi_document(app))
+
     @app.get("/v1/openapi.json", tags=["health"], dependencies=[Depends(caller(Scope.READ))])
     async def openapi() -> JSONResponse:
         """This interface, as OpenAPI."""
-        return JSONResponse(openapi_document(app))
+        return JSONResponse(document())
 
     app.state.request_seconds = RequestSeconds()
     app.state.rates = RateLimits(config.limits.rates)

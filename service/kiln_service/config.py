@@ -66,8 +66,8 @@ class Limits(Contract):
 class Timing(Contract):
     """Intervals in seconds."""
 
-    heartbeat_s: float = Field(default=5.0, gt=0)
-    """Told to workers: beat at least this often while a task runs."""
+    heartbeat_s: float = Field(default=3.0, gt=0)
+    """Told to workers: beat this often while a task runs. A canceled task has stopped after this and two seconds."""
     stale_s: float = Field(default=30.0, gt=0)
     """A running task without a heartbeat for this long has lost its worker."""
     poll_s: float = Field(default=1.0, gt=0)
@@ -89,6 +89,19 @@ class FailedTasks(Contract):
     """At least so many tasks of a kind,"""
     of_all: float = Field(default=0.1, ge=0, le=1)
     """and more than this share of all tasks of the kind."""
+
+
+class Retention(Contract):
+    """How long jobs that are over keep what they have; nothing goes where no days are given."""
+
+    archive_days: float | None = Field(default=None, ge=0)
+    """A job is archived so many days after its end."""
+    free_days: float | None = Field(default=None, ge=0)
+    """An archived job gives up its light fields so many days after its end; its package stays."""
+    keep: dict[str, str] = Field(default={"keep": "true"})
+    """Jobs with one of these labels are left alone."""
+    check_s: float = Field(default=3600.0, gt=0)
+    """Seconds between two rounds."""
 
 
 class ServiceConfig(Contract):
@@ -115,6 +128,7 @@ class ServiceConfig(Contract):
     """Database connections."""
     limits: Limits = Limits()
     timing: Timing = Timing()
+    retention: Retention = Retention()
 
     @field_validator("storage_url", "store_url", "blob_url")
     @classmethod

@@ -7,8 +7,10 @@ Blobs go with the coordinator's next collection. A run that is cut off is repeat
 
 import asyncio
 import shutil
+from collections.abc import Mapping
 
 import obstore
+from psycopg.types.json import Jsonb
 
 from kiln_schemas.operators import Freed, GcReport
 from kiln_schemas.states import JobState
@@ -24,11 +26,18 @@ class _DryRun(Exception):
 
 
 async def free_archived(
-    database: Database, config: ServiceConfig, days: float, *, dry_run: bool, actor: str
+    database: Database,
+    config: ServiceConfig,
+    days: float,
+    *,
+    dry_run: bool,
+    actor: str,
+    keep: Mapping[str, str] | None = None,
 ) -> GcReport:
-    """Free archived jobs that ended `days` ago or earlier; with `dry_run` only say what would go."""
+    """Free archived jobs that ended `days` ago or earlier and have no label of `keep`; with `dry_run` only say what."""
     async with database.transaction() as tx:
-        candidates = [row["id"] for row in await tx.all("find_freeable", days=days)]
+        rows = await tx.all("find_freeable", days=days, keep=Jsonb(dict(keep or {})))
+    candidates = [row["id"] for row in rows]
     freed = []
     for job_id in candidates:
         done = await _free(database, config, job_id, dry_run=dry_run)

@@ -1,4 +1,4 @@
-"""The coordinator's background work: reaper, collection of blobs.
+"""The coordinator's background work: reaper, collection of blobs, retention rules.
 
 Of all coordinators on a database one does it, the holder of a session's advisory lock; if it dies, another takes over.
 A new holder first waits out one stale period: while no coordinator ran, no heartbeat could arrive.
@@ -17,6 +17,7 @@ from kiln_service.blobs import Blobs
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, Tx
 from kiln_service.reaper import reap
+from kiln_service.retention import apply_rules
 from kiln_service.work import Work
 
 log = logging.getLogger(__name__)
@@ -30,7 +31,8 @@ class Maintenance:
 
     def __init__(self, database: Database, config: ServiceConfig, work: Work, blobs: Blobs) -> None:
         self._database, self._timing, self._work, self._blobs = database, config.timing, work, blobs
-        self._next_collection = 0.0
+        self._config = config
+        self._next_collection = self._next_retention = 0.0
 
     async def run(self) -> None:
         """Until canceled; a database that is away for a while is waited for."""
@@ -60,6 +62,9 @@ class Maintenance:
             if time.monotonic() >= self._next_collection:
                 self._next_collection = time.monotonic() + self._timing.blob_grace_s / 4
                 await self._blobs.collect(self._timing.blob_grace_s)
+            if time.monotonic() >= self._next_retention:
+                self._next_retention = time.monotonic() + self._config.retention.check_s
+                await apply_rules(self._database, self._config)
         except (psycopg.OperationalError, PoolTimeout):
             raise
         except Exception:

@@ -33,17 +33,13 @@ async def text(database: Database) -> bytes:
     """All metrics in the text format."""
     async with database.transaction() as tx:
         tasks, jobs = await tx.all("count_tasks"), await tx.all("count_jobs")
-        done, ended = await tx.all("sum_work"), await tx.all("count_events", kinds=list(ENDS))
-        seconds = await tx.all("seconds_of_tasks", bounds=[bound + 1e-9 for bound in TASK_SECONDS])
+        done = await tx.all("sum_work", bounds=[bound + 1e-9 for bound in TASK_SECONDS])
+        ended = await tx.all("count_events", kinds=list(ENDS))
         blobs, light = await tx.one("sum_blobs"), await tx.one("sum_light_fields")
     workers = await operators.list_workers(database)
     states = {state: sum(worker.state is state for worker in workers) for state in WorkerState}
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(
-        _Once(
-            [*_queue(tasks, jobs), *_work(done, ended), _durations(seconds), *_workers(states), *_storage(blobs, light)]
-        )
-    )
+    registry.register(_Once([*_queue(tasks, jobs), *_work(done, ended), *_workers(states), *_storage(blobs, light)]))
     return generate_latest(registry)
 
 
@@ -74,19 +70,11 @@ def _queue(tasks: Rows, jobs: Rows) -> Iterator[Metric]:
 
 
 def _work(done: Rows, ended: Rows) -> Iterator[Metric]:
-    by_kind = {row["kind"]: row for row in done}
-    family = CounterMetricFamily("lightkiln_tasks_completed", "Tasks that workers completed.", labels=["kind"])
-    for kind in TaskKind:
-        row = by_kind.get(kind.value)
-        family.add_metric([kind.value], row["tasks"] if row else 0)
-    yield family
-    rendered = by_kind.get(TaskKind.RENDER.value)
-    yield CounterMetricFamily(
-        "lightkiln_rendered_texels", "Texels of completed tiles.", value=rendered["texels"] if rendered else 0
-    )
-    yield CounterMetricFamily(
-        "lightkiln_traced_paths", "Paths of completed tiles.", value=rendered["paths"] if rendered else 0
-    )
+    yield _durations(done)
+    rendered = [row for row in done if row["kind"] == TaskKind.RENDER.value]
+    for name, column in (("lightkiln_rendered_texels", "texels"), ("lightkiln_traced_paths", "paths")):
+        value = sum(row[column] for row in rendered)
+        yield CounterMetricFamily(name, f"{column.capitalize()} of completed tiles.", value=value)
     counted = {row["kind"]: row["events"] for row in ended}
     family = CounterMetricFamily("lightkiln_attempts_without_result", "Attempts by how they ended.", labels=["how"])
     for event, how in ENDS.items():
@@ -94,11 +82,11 @@ def _work(done: Rows, ended: Rows) -> Iterator[Metric]:
     yield family
 
 
-def _durations(seconds: Rows) -> Metric:
+def _durations(done: Rows) -> Metric:
     """Busy seconds of completed tasks, as a histogram."""
     family = HistogramMetricFamily("lightkiln_task_seconds", "Busy seconds of completed tasks.", labels=["kind"])
     for kind in TaskKind:
-        rows = [row for row in seconds if row["kind"] == kind.value]
+        rows = [row for row in done if row["kind"] == kind.value]
         buckets, count = list[tuple[str, float]](), 0
         for number, bound in enumerate((*TASK_SECONDS, None)):
             count += sum(row["tasks"] for row in rows if row["bucket"] == number)

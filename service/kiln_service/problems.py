@@ -3,8 +3,9 @@
 Pure ASGI middleware, so that streamed bodies pass through untouched.
 """
 
+import contextlib
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, Final
 from urllib.parse import quote
@@ -106,7 +107,10 @@ def install(
 
 async def _kiln_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, KilnError)
-    return answer(request, error.problem())
+    response = answer(request, error.problem())
+    if isinstance(error, TooMany):
+        response.headers["Retry-After"] = str(error.wait_s)
+    return response
 
 
 async def _invalid_request(request: Request, error: Exception) -> Response:
@@ -238,10 +242,7 @@ class Authentication:
                 await response(scope, receive, send)
                 return
             except KilnError as error:
-                response = answer(request, error.problem())
-                if isinstance(error, TooMany):
-                    response.headers["Retry-After"] = str(error.wait_s)
-                await response(scope, receive, send)
+                await (await _kiln_error(request, error))(scope, receive, send)
                 return
             except (psycopg.OperationalError, PoolTimeout) as error:
                 await (await _database_away(request, error))(scope, receive, send)
@@ -258,17 +259,27 @@ class Authentication:
         if not safe:
             sessions.check_origin(request.headers)
         request.scope["session"] = cookie
-        return await sessions.principal_of(database, self._tokens, cookie)
+        with _counted(request) as may_sign_in:
+            may_sign_in()
+            return await sessions.principal_of(database, self._tokens, cookie)
 
     async def _by_token(self, request: Request, header: str | None) -> Principal:
-        """An address that failed too often is refused before a token is looked up in the database."""
-        state, address = request.app.state, request.client.host if request.client else ""
-        may_sign_in = partial(state.rates.may_sign_in, address)
-        try:
-            return await self._tokens.authenticate(header, state.parts.database, before_lookup=may_sign_in)
-        except AuthError:
-            state.rates.failed(address)
-            raise
+        with _counted(request) as may_sign_in:
+            return await self._tokens.authenticate(header, request.app.state.parts.database, before_lookup=may_sign_in)
+
+
+@contextlib.contextmanager
+def _counted(request: Request) -> Iterator[Callable[[], None]]:
+    """Count it where the block fails to sign in; gives what refuses an address that failed too often.
+
+    Called before the database is asked for a token or a session, which is what guesses cost.
+    """
+    rates, address = request.app.state.rates, request.client.host if request.client else ""
+    try:
+        yield partial(rates.may_sign_in, address)
+    except AuthError:
+        rates.failed(address)
+        raise
 
 
 def _sign_in_first(request: Request) -> Response | None:

@@ -203,6 +203,7 @@ def _job_view(job: JobRow, rows: dict[str, DictRow]) -> JobView:
         priority=job.priority,
         labels=job.labels,
         tags=job.tags,
+        outcome=job.outcome,
         submitter=job.submitter,
         renders_of=job.renders_of,
     )

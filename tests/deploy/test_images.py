@@ -83,9 +83,9 @@ def test_what_an_image_copies_and_runs_is_there(file):
 
 def test_what_each_image_needs():
     coordinator, worker = closure("service"), closure("worker")
-    assert {"fastapi", "psycopg", "procrastinate"} <= coordinator
+    assert {"fastapi", "psycopg", "obstore"} <= coordinator
     assert not coordinator & {"torch", "mitsuba", "drjit", "numpy", "tensorstore"}
-    assert {"torch", "mitsuba", "tensorstore"} <= worker and not worker & {"psycopg", "procrastinate", "fastapi"}
+    assert {"torch", "mitsuba", "tensorstore"} <= worker and not worker & {"psycopg", "fastapi"}
     # Of the worker's, whose installation is gigabytes, those that this platform has here are at the images' versions.
     for name in coordinator | worker:
         if name != "lightkiln" and name in PINNED:

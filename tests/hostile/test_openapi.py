@@ -39,6 +39,13 @@ CHECKS: Final = [
 ]
 SCHEMA: Final = schemathesis.openapi.from_dict(json.loads(DOCUMENT.read_text()))
 OPERATIONS: Final = {found.ok().label: found.ok() for found in SCHEMA.get_all_operations()}
+SCENE: Final = b"a scene"
+BUNDLE: Final = {"entry": "a.glb", "files": {"a.glb": hashlib.sha256(SCENE).hexdigest()}}
+GOOD: Final[dict[str, Any]] = {
+    **{"name": "x", "bundle": BUNDLE, "preset": "draft", "set": [], "settings": None, "gates": {}, "cameras": {}},
+    **{"attempt": 1, "version": __version__, "device": "none"},
+}
+"""Values that lead further than the first check: the files are there, the attempt runs."""
 CASES: Final = [
     (label, mode)
     for label, operation in OPERATIONS.items()
@@ -50,10 +57,9 @@ CASES: Final = [
 @pytest.fixture(scope="module")
 def there(target: Farm, owner: httpx.Client) -> dict[str, list[str]]:
     """Path parameters of things that are there, by name."""
-    data = b"a scene"
-    sha256 = hashlib.sha256(data).hexdigest()
-    owner.put(f"/v1/blobs/{sha256}", content=data).raise_for_status()
-    request = {"name": "x", "preset": "draft", "bundle": {"entry": "a.glb", "files": {"a.glb": sha256}}}
+    (sha256,) = BUNDLE["files"].values()
+    owner.put(f"/v1/blobs/{sha256}", content=SCENE).raise_for_status()
+    request = {"name": "x", "preset": "draft", "bundle": BUNDLE}
     jobs = [owner.post("/v1/jobs", json=request).raise_for_status().json()["id"] for _ in range(3)]
     worker = {
         "name": "w",
@@ -95,8 +101,12 @@ def test_every_answer_is_a_documented_one(
             case.path_parameters[name] = data.draw(
                 st.one_of(st.just(case.path_parameters[name]), st.sampled_from(there[name]))
             )
-        if isinstance(case.body, dict) and "wait_s" in case.body:
-            case.body["wait_s"] = min(case.body["wait_s"], 0.0) if isinstance(case.body["wait_s"], float) else 0
+        if label.endswith("/claim") and isinstance(case.body, dict):
+            wait_s = case.body.get("wait_s", 10.0)
+            if isinstance(wait_s, int | float) and 0 <= wait_s <= 30:
+                case.body["wait_s"] = 0  # held open otherwise
+        if isinstance(case.body, dict) and data.draw(st.booleans()):
+            case.body |= {key: value for key, value in GOOD.items() if key in case.body}
         if label.endswith("/events"):
             case.query = {**(case.query or {}), "format": "json"}  # a stream of a live job has no end
         if label.endswith("/log") and (case.query or {}).get("follow") is True:

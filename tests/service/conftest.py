@@ -49,6 +49,13 @@ def dsn(postgres: EmbeddedPostgres, request: pytest.FixtureRequest) -> Iterator[
         yield dsn
 
 
+@pytest.fixture
+def other_dsn(dsn: str, postgres: EmbeddedPostgres) -> Iterator[str]:
+    """A second, empty database."""
+    with new_database(postgres, dsn.rpartition("=")[2] + "_other") as other:
+        yield other
+
+
 @contextmanager
 def new_database(postgres: EmbeddedPostgres, name: str) -> Iterator[str]:
     with psycopg.connect(postgres.dsn, autocommit=True) as connection:

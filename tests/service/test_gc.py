@@ -5,6 +5,8 @@ from urllib.parse import urlparse
 
 import pytest
 
+from kiln_service.config import Retention
+
 
 def baked(home, **changes):
     """A completed job with a store on the disk."""
@@ -94,3 +96,54 @@ def test_a_store_elsewhere_is_left_alone(home, tmp_path):
 @pytest.mark.parametrize("body", [{"days": -1}, {"days": "x"}, {"dry_run": 3}, {"more": 1}])
 def test_wrong_requests_are_refused(shared, body):
     assert shared.client.post("/v1/gc", json=body).status_code == 422
+
+
+def aged(home, job_id, days):
+    home.sql("UPDATE jobs SET finished = now() - make_interval(days => %s) WHERE id = %s", days, job_id)
+
+
+def test_retention_rules_archive_and_free_what_is_old_and_nothing_that_is_needed(start, eventually):
+    rules = Retention(archive_days=30, free_days=60, check_s=0.1)
+    with start() as home:
+        young, old, ancient, kept, read = (baked(home, set=[f"render.samples={8 + n}"]) for n in range(5))
+        home.client.patch(f"/v1/jobs/{kept}", json={"labels": {"keep": "true"}}).raise_for_status()
+        live = home.submit(set=["render.samples=12", "fit.lobes=4"])["id"]
+        worker = home.worker()
+        worker.finish(worker.must_claim("prepare"))
+        running = worker.must_claim()
+        assert home.job(live)["renders_of"] == read and running["job_id"] == live
+        for job_id, days in ((young, 29), (old, 31), (ancient, 61), (kept, 1000), (read, 1000)):
+            aged(home, job_id, days)
+    with start(retention=rules) as home:
+        eventually(lambda: home.sql("SELECT id FROM jobs WHERE id = %s AND freed IS NOT NULL", ancient))
+        eventually(lambda: home.sql("SELECT id FROM jobs WHERE id = %s AND freed IS NOT NULL", read))
+        states = {job_id: home.job(job_id)["state"] for job_id in (young, old, ancient, kept, read, live)}
+        assert states == {
+            young: "completed",
+            old: "archived",
+            ancient: "archived",
+            kept: "completed",
+            read: "archived",
+            live: "active",
+        }
+        assert not store_of(home, ancient).exists()
+        assert all(store_of(home, job_id).exists() for job_id in (young, old, kept))
+        assert store_of(home, live).exists(), "a job that runs reads it"
+        assert home.events(old)[-1]["actor"] == "coordinator" and home.events(old)[-1]["kind"] == "job.archived"
+        assert home.client.get(f"/v1/jobs/{ancient}/artifacts").json() != []
+        audit = home.client.get("/v1/audit").json()
+        assert {entry["actor"] for entry in audit if entry["action"] == "gc"} == {"coordinator"}
+
+
+def test_without_rules_nothing_goes(start, eventually):
+    with start() as home:
+        job = baked(home)
+        aged(home, job, 10_000)
+        archive(home, baked(home, set=["render.samples=9"]))
+    with start(retention=Retention(check_s=0.05)) as home:
+        unused = home.sql("SELECT count(*) AS freed FROM jobs WHERE freed IS NOT NULL")
+        lead = "SELECT objid FROM pg_locks WHERE locktype = 'advisory'"
+        eventually(lambda: home.sql(lead))
+        home.worker().claim(wait_s=1)
+        assert unused == [{"freed": 0}] and home.job(job)["state"] == "completed"
+        assert home.sql("SELECT count(*) AS freed FROM jobs WHERE freed IS NOT NULL") == [{"freed": 0}]

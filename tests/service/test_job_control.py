@@ -248,3 +248,19 @@ def test_a_log_is_followed_to_its_end(home):
                 worker.finish(claim)
     assert "".join(pieces) == "one\ntwo\nthree\n"
     assert home.client.get("/v1/tasks/none/log", params={"follow": True}).status_code == 404
+
+
+def test_an_archived_job_tells_how_it_ended(home):
+    completed, canceled, worker = home.submit(), home.submit(), home.worker()
+    act(home, canceled, "cancel").raise_for_status()
+    finish_all(worker)
+    for job, outcome in ((completed, "completed"), (canceled, "canceled")):
+        assert home.job(job["id"])["outcome"] == outcome
+        assert act(home, job, "archive").json()["outcome"] == outcome
+
+
+def test_a_job_that_is_done_again_has_not_ended(home):
+    job, worker = home.submit(), home.worker()
+    finish_all(worker)
+    requeue(home, job, kind="package").raise_for_status()
+    assert home.job(job["id"])["outcome"] is None

@@ -156,7 +156,7 @@ def test_metrics_tell_what_the_farm_does(home):
     found = {(s.name, *sorted(s.labels.values())): s.value for family in families for s in family.samples}
     assert found["lightkiln_tasks", "queued", "render"] == found["lightkiln_tasks", "render", "soft-failed"] == 1
     assert found["lightkiln_tasks", "render", "waiting"] == 0
-    assert found["lightkiln_tasks_completed_total", "render"] == 1
+    assert found["lightkiln_task_seconds_count", "render"] == 1
     assert found["lightkiln_task_seconds_sum", "prepare"] == 0.5
     assert [found["lightkiln_task_seconds_bucket", le, "prepare"] for le in ("1.0", "5.0", "+Inf")] == [1, 1, 1]
     assert found["lightkiln_task_seconds_count", "prepare"] == 1 and found["lightkiln_task_seconds_count", "fit"] == 0

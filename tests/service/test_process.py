@@ -1,5 +1,6 @@
 """The real process: killed, restarted, stopped, started twice."""
 
+import hashlib
 import json
 import os
 import signal
@@ -10,6 +11,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import httpx
 import pytest
@@ -101,6 +103,19 @@ def test_kill_and_restart(folder):
         code, errors = second.stop(signal.SIGTERM)
         assert code == 0 and "Traceback" not in errors
     assert servers_of(folder) == []
+
+
+def test_a_copy_of_the_folder_is_a_backup(folder):
+    data = b"kept"
+    sha256 = hashlib.sha256(data).hexdigest()
+    with coordinator(folder) as running:
+        running.client.put(f"/v1/blobs/{sha256}", content=data).raise_for_status()
+        code, _ = running.stop(signal.SIGTERM)
+        assert code == 0
+    with TemporaryDirectory(prefix="kiln-test-") as elsewhere:
+        subprocess.run(["cp", "-a", folder, f"{elsewhere}/copy"], check=True)
+        with coordinator(f"{elsewhere}/copy") as running:
+            assert running.client.get(f"/v1/blobs/{sha256}").content == data
 
 
 def test_a_killed_coordinator_takes_its_database_along(folder):

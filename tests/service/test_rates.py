@@ -78,6 +78,17 @@ def test_sign_ins_that_fail_are_bounded_and_known_tokens_are_not(start):
         assert httpx.get(f"{home.url}/healthz").status_code == 200
 
 
+def test_guessed_cookies_and_forms_are_bounded_too(start):
+    with start(limits=limits(failures=SLOW)) as home:
+
+        def shown(cookie):
+            return httpx.get(f"{home.url}/jobs", cookies={"kiln_session": cookie}).status_code
+
+        assert [shown(f"guess-{n}") for n in range(5)] == [401, 401, 401, 429, 429]
+        refused = httpx.post(f"{home.url}/login", data={"token": home.token})
+        assert refused.status_code == 429 and int(refused.headers["retry-after"]) > 0
+
+
 def test_the_client_waits_as_long_as_it_is_told(start):
     with start(limits=limits(clients=Rate(per_s=1, burst=1))) as home:
         with Client(home.url, home.token, patience_s=20) as patient:

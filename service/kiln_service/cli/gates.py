@@ -12,10 +12,10 @@ from kiln_service.cli.fetch import writing
 
 
 def end_of(job: JobView) -> Problem | None:
-    """What a job that is over ended with; None where it completed. An archived one is told by its error."""
-    if job.state is JobState.COMPLETED or (job.state is JobState.ARCHIVED and job.error is None):
+    """What a job that is over ended with, archived or not; None where it completed."""
+    if job.outcome is JobState.COMPLETED:
         return None
-    if job.state is JobState.CANCELED:
+    if job.outcome is JobState.CANCELED:
         return Canceled(f"the job {job.id} was canceled").problem()
     return job.error or InternalError(f"the job {job.id} is {job.state} without an error").problem()
 

@@ -82,15 +82,11 @@ SELECT kind, state, count(*) AS tasks FROM tasks GROUP BY kind, state;
 SELECT state, count(*) AS jobs FROM jobs GROUP BY state;
 
 -- name: sum_work
--- Completed attempts by kind, and what tiles rendered.
-SELECT kind, count(*) AS tasks, COALESCE(sum((result ->> 'paths')::float8), 0) AS paths,
-       COALESCE(sum((spec -> 'tile' ->> 'texels')::float8), 0) AS texels
-FROM tasks WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind;
-
--- name: seconds_of_tasks
--- Completed attempts by kind and by the number of the bounds, in seconds, that each took longer than.
+-- Completed attempts by kind and by how many of the bounds, in seconds, each took longer than; what tiles rendered.
 SELECT kind, width_bucket((result ->> 'seconds')::float8, %(bounds)s::float8[]) AS bucket, count(*) AS tasks,
-       sum((result ->> 'seconds')::float8) AS seconds
+       sum((result ->> 'seconds')::float8) AS seconds,
+       COALESCE(sum((result ->> 'paths')::float8), 0) AS paths,
+       COALESCE(sum((spec -> 'tile' ->> 'texels')::float8), 0) AS texels
 FROM tasks WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind, bucket;
 
 -- name: sum_light_fields
@@ -111,10 +107,18 @@ SELECT kind, count(*) AS events FROM events WHERE kind = ANY(%(kinds)s) GROUP BY
 SELECT COALESCE(sum(size), 0)::bigint AS bytes, count(*) AS blobs FROM blobs;
 
 -- name: find_freeable
--- Archived jobs that ended before `days` ago and whose data is still there, oldest first.
+-- Archived jobs that ended before `days` ago, have none of the labels and whose data is still there, oldest first.
 SELECT id FROM jobs
 WHERE state = 'archived' AND freed IS NULL AND finished < now() - make_interval(secs => %(days)s * 86400.0)
+  AND NOT EXISTS (SELECT FROM jsonb_each_text(%(keep)s) AS kept WHERE jobs.labels ->> kept.key = kept.value)
 ORDER BY id;
+
+-- name: find_archivable
+-- Jobs in one of the states that ended before `days` ago and have none of the labels, oldest first.
+SELECT id FROM jobs
+WHERE state = ANY(%(states)s) AND finished < now() - make_interval(secs => %(days)s * 86400.0)
+  AND NOT EXISTS (SELECT FROM jsonb_each_text(%(keep)s) AS kept WHERE jobs.labels ->> kept.key = kept.value)
+ORDER BY id LIMIT 1000;
 
 -- name: stores_needed_by_others
 -- Which of these stores jobs read that are not freed; the job itself apart.

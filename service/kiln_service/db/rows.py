@@ -47,6 +47,7 @@ class JobRow(_Row):
     tags: tuple[str, ...]
     submitter: str | None
     renders_of: str | None
+    outcome: JobState | None
     notes: tuple[str, ...]
     error: Problem | None
     created: datetime
@@ -62,6 +63,7 @@ class JobRow(_Row):
             | {
                 "state": JobState(values["state"]),
                 "settings": BakeSettings.model_validate(values["settings"]),
+                "outcome": values["outcome"] and JobState(values["outcome"]),
                 "bundle": Bundle.model_validate(values["bundle"]),
                 "gates": Gates.model_validate(values["gates"]),
                 "cameras": {name: Camera.model_validate(tree) for name, tree in values["cameras"].items()},

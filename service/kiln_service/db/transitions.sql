@@ -23,6 +23,7 @@ FROM jsonb_to_recordset(%(tasks)s)
 -- Move a job, with the times and the error that belong to the move.
 UPDATE jobs
 SET state = %(after)s,
+    outcome = CASE WHEN %(after)s::text = 'archived' THEN outcome WHEN %(final)s THEN %(after)s ELSE NULL END,
     error = CASE WHEN %(after)s::text = 'queued' THEN NULL ELSE COALESCE(%(error)s, error) END,
     started = CASE WHEN %(after)s::text = 'active' THEN COALESCE(started, now()) ELSE started END,
     finished = CASE WHEN %(after)s::text = 'queued' THEN NULL WHEN %(final)s THEN COALESCE(finished, now()) ELSE finished END

@@ -46,8 +46,6 @@ from kiln_workers.runner.client import CoordinatorClient
 from kiln_workers.runner.protocol import Done, Failed, Ready, Report, Setup, Stop, Work
 
 START_TIMEOUT_S: Final = 180.0
-NEWS_S: Final = 2.0
-"""Beats come this often while there is something new to tell, and at the coordinator's interval otherwise."""
 STOP_GRACE_S: Final = 2.0
 """How long a child may take to leave a task that is not wanted before it is killed and has to load all anew."""
 FAREWELL_S: Final = 3.0
@@ -192,21 +190,20 @@ class Worker:
     def _attend(self, child: ChildProcess, claim: Claim, welcome: WorkerWelcome) -> Done | Failed | Ended | None:
         """Heartbeat until the child has an answer; None where the attempt is not wanted any more."""
         progress: Progress | None = None
-        beaten, news = 0.0, True
+        beaten = 0.0
         while True:
-            interval = min(NEWS_S, welcome.heartbeat_s) if news or self._lines else welcome.heartbeat_s
-            due = beaten + interval - time.monotonic()
+            due = beaten + welcome.heartbeat_s - time.monotonic()
             try:
                 answer = child.answers.get(timeout=max(0.0, due))
             except queue.Empty:
                 if not self._beat(claim, welcome, progress):
                     self._stop_child(child)
                     return None
-                beaten, news = time.monotonic(), False
+                beaten = time.monotonic()
                 continue
             match answer:
                 case Report(progress=progress):
-                    news = True
+                    continue
                 case Done() | Failed():
                     child.hear_out()
                     return answer
