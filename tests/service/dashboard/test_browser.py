@@ -156,7 +156,7 @@ def test_a_tile_that_failed_once_stands_out(home, dashboard, known_bake):
     assert red > green > blue  # orange
 
 
-def test_losses_and_the_log_are_followed_while_a_fit_runs(home, dashboard, known_bake):
+def test_losses_and_the_log_are_followed_while_a_fit_runs(home, dashboard, known_bake, screenshot, axe):
     job = home.submit()["id"]
     bake, worker = known_bake(job), home.worker()
     worker.finish(worker.must_claim(), tiles=1, texel_map=bake.texel_map)
@@ -175,6 +175,8 @@ def test_losses_and_the_log_are_followed_while_a_fit_runs(home, dashboard, known
     expect(page.get_by_role("log")).to_contain_text("more of it")
     end = "log => Math.abs(log.scrollHeight - log.scrollTop - log.clientHeight) < 2"
     assert page.get_by_role("log").evaluate(end)
+    assert axe(page) == []
+    screenshot(page, "task")
 
 
 def test_a_clicked_texel_shows_what_was_rendered_and_what_the_lobes_make_of_it(home, dashboard, baked, screenshot, axe):
