@@ -109,6 +109,8 @@ def test_every_answer_is_a_documented_one(
             case.body |= {key: value for key, value in GOOD.items() if key in case.body}
         if label.endswith("/events"):
             case.query = {**(case.query or {}), "format": "json"}  # a stream of a live job has no end
+        if label.endswith("/log"):
+            case.query = {key: value for key, value in (case.query or {}).items() if key != "follow"}
         response = case.call(base_url=target.url, headers={"Authorization": f"Bearer {target.token}"}, timeout=20)
         answers[response.status_code] = answers.get(response.status_code, 0) + 1
         case.validate_response(response, checks=CHECKS)
