@@ -81,7 +81,15 @@ def check_origin(headers: Headers) -> None:
     """Forbidden where a browser says that another site has sent the request (Fetch Metadata; RFC 6454, 7)."""
     site, origin = headers.get("sec-fetch-site"), headers.get("origin")
     foreign = site not in (None, "same-origin") or (
-        site is None and origin is not None and urlsplit(origin).netloc != headers.get("host")
+        site is None and origin is not None and _host(origin) != headers.get("host")
     )
     if foreign:
         raise Forbidden("another site has sent this request", where="Origin", remedy="Use the dashboard's own pages.")
+
+
+def _host(origin: str) -> str | None:
+    """The host and port of an origin, None where it is not one."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None

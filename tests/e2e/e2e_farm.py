@@ -110,6 +110,8 @@ class Farm:
     port: int = 0
     token: str = ""
     processes: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)
+    """Of the coordinator, besides its timing."""
 
     @property
     def url(self) -> str:
@@ -121,7 +123,7 @@ class Farm:
                 probe.bind((HOST, 0))
                 self.port = probe.getsockname()[1]
         data, config = self.folder / "data", self.folder / "coordinator.json"
-        config.write_text(json.dumps({"timing": TIMING}))
+        config.write_text(json.dumps({"timing": TIMING} | self.config))
         where = ["--port", str(self.port), "--data", str(data), "--config", str(config)]
         self._start("coordinator", ["-m", "kiln_service", *where, *flags])
         wait_until("the coordinator is ready", self._ready)

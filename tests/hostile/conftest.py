@@ -23,7 +23,9 @@ def hostile_folder() -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def target(hostile_folder: Path) -> Iterator[Farm]:
     """The coordinator that takes it all; its process is the same at the end."""
-    farm = Farm(hostile_folder / "farm")
+    often = {"per_s": 1e6, "burst": 1_000_000}
+    rates = {"clients": often, "workers": often, "failures": often}
+    farm = Farm(hostile_folder / "farm", config={"limits": {"rates": rates}})
     farm.folder.mkdir()
     try:
         farm.start_coordinator()

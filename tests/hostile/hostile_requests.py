@@ -368,6 +368,45 @@ def _blobs() -> Iterator[Call]:
     yield posted("gc for ever", "/v1/gc", b'{"days": 1e999}', 422, "days")
 
 
+def _pages() -> Iterator[Call]:
+    """What browsers ask, by a program that is none."""
+    form = {"Content-Type": "application/x-www-form-urlencoded"}
+
+    def sent(name: str, path: str, body: bytes, status: int, word: str, **headers: str) -> Call:
+        return Call(f"page: {name}", "POST", path, status, word, body, {**form, **headers})
+
+    yield sent("a form of 10000 fields", "/login", b"&".join(b"f%d=1" % i for i in range(10_000)), 422, "fields")
+    yield sent("a form of 17 MiB", "/login", b"token=" + b"x" * (17 << 20), 413, "bytes")
+    for origin in ("http://evil.example", "null", "http://[::1", "http://127.0.0.1:99999", "\xff"):
+        yield sent(f"from {origin!r}", "/login", b"token=x", 403, "another site", Origin=origin)
+    yield sent("from another site", "/login", b"token=x", 403, "another site", **{"Sec-Fetch-Site": "cross-site"})
+    for priority in ("", "high", "-1", "101", "9" * 400, "1.5", "%00", "%C2%B2"):
+        path = f"/jobs/{NOBODY}/priority"
+        yield sent(f"the priority {priority[:20]!r}", path, f"priority={priority}".encode(), 422, "priority")
+    yield sent("an action that there is not", f"/jobs/{NOBODY}/do/explode", b"", 422, "action")
+    yield sent("an action on no job", f"/jobs/{NOBODY}/do/cancel", b"", 404, "job")
+    yield sent("an action on U+0000", "/jobs/%00/do/cancel", b"", 422, "U+0000")
+    yield sent("an order to no worker", f"/workers/{NOBODY}/orders/drain", b"", 404, "worker")
+    outside = ("../token", "..%2f..%2ftoken", "%2e%2e/%2e%2e/token", "/etc/passwd", "..\\..\\token")
+    for path in (*outside, "%00", "x" * 4000):
+        yield Call(f"page: the static file {path[:30]!r}", "GET", f"/static/{path}", 404, "")
+    for place in ("-1/0", "0/8192", "99999999999999999999/0", "a/b", "0/%00"):
+        yield Call(f"page: the texel {place}", "GET", f"/jobs/{NOBODY}/texels/{place}", 422, "")
+        yield Call(f"page: the tile {place}", "GET", f"/jobs/{NOBODY}/tiles/{place}", 422, "")
+    yield Call("page: the irradiance of no tile", "GET", f"/jobs/{NOBODY}/irradiance", 422, "tile")
+    for path in ("atlas", "texels", "texels/0/0", "tiles/0/0"):
+        yield Call(f"page: {path} of no job", "GET", f"/jobs/{NOBODY}/{path}", 404, "no ")
+        yield Call(f"page: {path} of U+0000", "GET", f"/jobs/%00/{path}", 422, "U+0000")
+    yield Call("page: jobs named U+0000", "GET", "/jobs?q=%00", 422, "U+0000")
+    yield Call("page: a page that is SQL", "GET", "/jobs?cursor='--", 422, "cursor")
+    yield Call("page: a task that there is not", "GET", f"/tasks/{NOBODY}", 404, "task")
+    yield Call("page: the task U+0000", "GET", "/tasks/%00", 422, "U+0000")
+    yield posted("page: no job", "/submit", b"[]", 422, "body")
+    yield posted("page: a job of files outside", "/submit", changed("bundle.files", {"../a": SHA}), 422, "bundle.files")
+    for cookie in ("kiln_session=x", "kiln_session=" + "x" * 10_000, 'a=b; ;;=;\\"', "\xff=\xfe"):
+        yield Call(f"page: the cookie {cookie[:24]!r}", "GET", "/jobs", 401, "", None, {"Cookie": cookie}, None)
+
+
 def _raw() -> Iterator[Raw]:
     def request(head: str, body: bytes = b"", method: str = "POST", path: str = "/v1/jobs") -> bytes:
         lines = [
@@ -405,5 +444,5 @@ def _raw() -> Iterator[Raw]:
     yield Raw("a path with a line break", b"GET /v1/jobs\x0b HTTP/1.1\r\nHost: x\r\n\r\n", (0, 400, 401))
 
 
-CALLS: Final = [*_job_requests(), *_routes(), *_tokens(), *_webhooks(), *_workers(), *_blobs()]
+CALLS: Final = [*_job_requests(), *_routes(), *_tokens(), *_webhooks(), *_workers(), *_blobs(), *_pages()]
 RAW: Final = list(_raw())

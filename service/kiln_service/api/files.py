@@ -12,9 +12,6 @@ from kiln_service.problems import problem_response
 
 _RANGE: Final = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
-INERT: Final = {"X-Content-Type-Options": "nosniff", "Content-Security-Policy": "sandbox"}
-"""A page among the files, shown by a browser, has no script and is not of the coordinator's origin."""
-
 
 def parse_range(header: str, size: int) -> tuple[int, int] | None:
     """First and past-the-end byte of a Range header's one range.
@@ -45,7 +42,7 @@ def matches(header: str | None, etag: str) -> bool:
 async def serve_blob(request: Request, blobs: Blobs, sha256: str, size: int, media_type: str) -> Response:
     """The answer to GET or HEAD of a blob."""
     etag = f'"{sha256}"'
-    headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": "private, no-cache"} | INERT
+    headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": "private, no-cache"}
     if matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     wanted = request.headers.get("range")

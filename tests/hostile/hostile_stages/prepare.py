@@ -24,8 +24,10 @@ OTHERS = {"subprocess.Popen", "os.exec", "os.posix_spawn", "os.system", "socket.
 LIBRARIES = (
     *{sys.prefix, sys.base_prefix, *sysconfig.get_paths().values(), *site.getsitepackages()},
     *(str(Path(prepare.__file__).parents[1]), str(Path(__file__).parent)),
-    *("/usr/lib", "/lib", "/etc/ld.so", "/proc", "/sys", "/dev"),
+    *("/usr/lib", "/lib", "/etc/ld.so"),
 )
+COORDINATOR = ("'127.0.0.1'", "('127.0.0.1', ", "b'127.0.0.1'")
+"""What it may connect to."""
 
 _seen: list[str] | None = None
 
@@ -41,7 +43,7 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
             if isinstance(path, str | bytes | os.PathLike):
                 _seen.append(f"{event} {folder / os.fsdecode(path)}")
     else:
-        _seen.append(f"{event} {arguments[:2]!r}")
+        _seen.append(f"{event} {arguments[-1 if event == 'socket.connect' else 0]!r}")
 
 
 sys.addaudithook(_hook)
@@ -58,7 +60,7 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         return prepare.run(payload, context)
     finally:
         seen, _seen = _seen, None
-        strays = sorted({act for act in seen if not act.partition(" ")[2].startswith(allowed)})
+        strays = sorted({act for act in seen if not act.partition(" ")[2].startswith((*allowed, *COORDINATOR))})
         report = {
             "acts": len(seen),
             "strays": strays[:20],
