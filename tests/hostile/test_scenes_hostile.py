@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,8 @@ class Range:
     child: int
     outside: Path
     watch: WatchedFolder
+    grown: dict[str, int] = field(default_factory=dict)  # by the bundle's name
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +91,13 @@ def fired(target: Farm, owner: httpx.Client, hostile_folder: Path, outside: Path
             worker = psutil.Process(started.pid)
             (child,) = worker.children()
             watch.acts()  # of the building
-            yield Range(owner, jobs, worker, child.pid, outside, watch)
+            fired = Range(owner, jobs, worker, child.pid, outside, watch)
+            yield fired
+            for what, values, unit in (("memory", fired.grown, 1 << 20), ("time", fired.seconds, 1)):
+                name = max(values, key=lambda name: values[name], default=None)
+                if name is None:
+                    continue
+                print(f"most {what}: {values[name] / unit:.1f} {'MiB' if unit > 1 else 's'} for {name}")
         finally:
             started.terminate()
             started.wait(30)
@@ -136,6 +144,7 @@ def test_a_bundle_is_refused(fired: Range, bad: Bad) -> None:
     told = json.loads(line.removeprefix("WATCHED "))
     assert told["strays"] == [] and told["acts"] > 0
     assert told["grown"] < GROWTH_BYTES, told
+    fired.grown[bad.name], fired.seconds[bad.name] = told["grown"], told["seconds"]
     assert fired.watch.acts() == [], "a file outside was touched"
     assert [child.pid for child in fired.worker.children()] == [fired.child], "the worker's process died"
 
