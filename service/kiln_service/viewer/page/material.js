@@ -67,9 +67,8 @@ export function makeMaterial(described, shaders, shared, environment) {
     const texture = described[key];
     if (!texture) continue;
     defines[`LK_${define}_MAP`] = "";
-    texture.updateMatrix();
     own[`${names[define]}Map`] = { value: texture };
-    own[`${names[define]}Transform`] = { value: texture.matrix };
+    own[`${names[define]}Transform`] = { value: textureTransform(texture) };
   }
   const fragment = [...INCLUDES, "surface.frag.glsl"].map((name) => shaders[name]).join("\n");
   return new THREE.RawShaderMaterial({
@@ -81,6 +80,13 @@ export function makeMaterial(described, shaders, shared, environment) {
     side: THREE.DoubleSide,
     userData: { roughness: described.roughness },
   });
+}
+
+// KHR_texture_transform as it is specified: scaled, then rotated, then moved. three.js' own matrix rotates first, which is
+// another one where the two scales differ.
+function textureTransform({ offset, repeat, rotation }) {
+  const [c, s] = [Math.cos(rotation), Math.sin(rotation)];
+  return new THREE.Matrix3().set(c * repeat.x, s * repeat.y, offset.x, -s * repeat.x, c * repeat.y, offset.y, 0, 0, 1);
 }
 
 // The attributes under the names that the package's vertex shader reads.

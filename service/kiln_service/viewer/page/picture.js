@@ -2,7 +2,7 @@
 // it is, for tests and for comparison with `lightkiln shade`.
 
 import * as THREE from "../vendor/three/three.module.min.js";
-import { PRECISION, makeMaterial, makeShared, nameAttributes } from "./material.js";
+import { INCLUDES, PRECISION, makeMaterial, makeShared, nameAttributes } from "./material.js";
 
 export const TERMS = ["emission", "diffuse", "interreflection", "environment", "unoccluded", "background"];
 export const TONE_MAPS = ["reinhard", "neutral", "none"];
@@ -30,12 +30,9 @@ void main() {
 `;
 
 // 0: Reinhard et al. 2002, eq. 4, on luminance, as lightkiln's own pictures; 1: Khronos PBR Neutral; 2: clipped.
-const DISPLAY = `${PRECISION}
-uniform sampler2D uRadiance;
+const TONE = `
 uniform float uExposure;
 uniform int uToneMap;
-in vec2 vClip;
-out vec4 colour;
 vec3 neutral(vec3 c) {
   const float start = 0.8 - 0.04, desaturation = 0.15;
   float x = min(c.r, min(c.g, c.b));
@@ -45,8 +42,8 @@ vec3 neutral(vec3 c) {
   float d = 1.0 - start, top = 1.0 - d * d / (peak + d - start);
   return mix(c * top / peak, vec3(top), 1.0 - 1.0 / (desaturation * (peak - top) + 1.0));
 }
-void main() {
-  vec3 c = max(texture(uRadiance, 0.5 + 0.5 * vClip).rgb, 0.0) * uExposure;
+vec3 displayed(vec3 radiance) {
+  vec3 c = max(radiance, 0.0) * uExposure;
   if (uToneMap == 0) {
     float light = dot(c, vec3(0.2126, 0.7152, 0.0722));
     c *= (1.0 + light / 4.0) / (1.0 + light);
@@ -54,9 +51,35 @@ void main() {
     c = neutral(c);
   }
   c = clamp(c, 0.0, 1.0);
-  colour = vec4(mix(12.92 * c, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c)), 1.0);
+  return mix(12.92 * c, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c));
 }
 `;
+
+const DISPLAY = `${PRECISION}${TONE}
+uniform sampler2D uRadiance;
+in vec2 vClip;
+out vec4 colour;
+void main() {
+  colour = vec4(displayed(texture(uRadiance, 0.5 + 0.5 * vClip).rgb), 1.0);
+}
+`;
+
+// The light field of a point of the light map, as a sphere that shows at each place the light from its direction.
+const SPHERE = `${TONE}
+uniform sampler2DArray uLightField;
+uniform int uLightFieldLobes;
+uniform vec2 uAt;
+uniform mat3 uFromCamera;
+in vec2 vClip;
+out vec4 colour;
+void main() {
+  float square = dot(vClip, vClip);
+  if (square > 1.0) discard;
+  vec3 direction = uFromCamera * vec3(vClip, sqrt(1.0 - square));
+  colour = vec4(displayed(lkLobeSum(uLightField, uLightFieldLobes, uAt, direction)), 1.0);
+}
+`;
+const SPHERE_SHARE = 0.3; // of the picture's shorter side
 
 export class Picture {
   constructor(canvas, opened) {
@@ -78,7 +101,10 @@ export class Picture {
     this.exposure = 1;
     this.toneMap = "reinhard";
     this.background = true;
-    this.target = null;
+    this.lobes = this.shared.uLightFieldLobes.value;
+    this.target = new THREE.Vector3(); // what the camera looks at
+    this.at = null; // [u, v] of the light map whose light field is shown
+    this.film = null;
     this.sky = fullScreen(BACKGROUND, {
       uEnvironment: { value: opened.textures["environment_ggx.ktx2"] ?? null },
       uToWorld: { value: new THREE.Matrix4() },
@@ -88,6 +114,14 @@ export class Picture {
       uRadiance: { value: null },
       uExposure: { value: 1 },
       uToneMap: { value: 0 },
+    });
+    this.sphere = fullScreen(PRECISION + INCLUDES.map((name) => opened.shaders[name]).join("\n") + SPHERE, {
+      uLightField: this.shared.uLightField,
+      uLightFieldLobes: this.shared.uLightFieldLobes,
+      uExposure: this.display.material.uniforms.uExposure,
+      uToneMap: this.display.material.uniforms.uToneMap,
+      uAt: { value: new THREE.Vector2() },
+      uFromCamera: { value: new THREE.Matrix3() },
     });
   }
 
@@ -122,19 +156,57 @@ export class Picture {
     this.camera.up.set(...up);
     this.camera.position.set(...position);
     this.camera.fov = fov;
-    this.camera.lookAt(...target);
+    this.target.set(...target);
+    this.camera.lookAt(this.target);
   }
 
   // Draw onto the canvas at its size in device pixels.
   draw(width, height) {
+    this.setMipmaps(true);
     this.renderer.setSize(width, height, false);
     this.#radiance(this.#targetOf(width, height, THREE.HalfFloatType, 4), width / height);
     const { uniforms } = this.display.material;
-    uniforms.uRadiance.value = this.target.texture;
+    uniforms.uRadiance.value = this.film.texture;
     uniforms.uExposure.value = this.exposure;
     uniforms.uToneMap.value = TONE_MAPS.indexOf(this.toneMap);
     this.renderer.setRenderTarget(null);
     this.renderer.render(this.display, this.camera);
+    if (this.at !== null) this.#drawSphere(width, height);
+  }
+
+  // Wait until all is drawn: what WebGL was told to do is done only when somebody reads it.
+  finish() {
+    const gl = this.renderer.getContext();
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+  }
+
+  // Show the light field of what is at x, y in [-1, 1] of the picture; none where no surface is.
+  pointAt(x, y) {
+    const ray = new THREE.Raycaster();
+    this.camera.updateMatrixWorld();
+    ray.setFromCamera(new THREE.Vector2(x, y), this.camera);
+    this.at = ray.intersectObjects(this.opened.meshes)[0]?.uv1.toArray() ?? null;
+  }
+
+  #drawSphere(width, height) {
+    const side = Math.round(SPHERE_SHARE * Math.min(width, height));
+    const { uniforms } = this.sphere.material;
+    uniforms.uAt.value.set(...this.at);
+    uniforms.uFromCamera.value.setFromMatrix4(this.camera.matrixWorld);
+    this.renderer.setViewport(8, 8, side, side);
+    this.renderer.render(this.sphere, this.camera);
+    this.renderer.setViewport(0, 0, width, height);
+  }
+
+  // Whether the materials' textures are filtered with mips, as on the screen, or not, as `lightkiln shade` does.
+  setMipmaps(used) {
+    const minFilter = used ? THREE.LinearMipmapLinearFilter : THREE.LinearFilter;
+    const maps = ["uBaseColorMap", "uMetallicRoughnessMap", "uEmissionMap"];
+    for (const { material } of this.opened.meshes) {
+      for (const texture of maps.map((name) => material.uniforms[name]?.value)) {
+        if (texture && texture.minFilter !== minFilter) Object.assign(texture, { minFilter, needsUpdate: true });
+      }
+    }
   }
 
   // Linear radiance, Float32Array [height][width][RGBA], row 0 at the top; alpha is 0 where nothing was drawn. The picture
@@ -142,6 +214,7 @@ export class Picture {
   // pixel or so, which would otherwise shift every attribute.
   capture(width, height, finer = 1) {
     if (!this.floats) throw new Error("This browser cannot draw to float targets (EXT_color_buffer_float).");
+    this.setMipmaps(false);
     const [wide, high] = [width * finer, height * finer];
     const target = this.#targetOf(wide, high, THREE.FloatType, 0);
     this.#radiance(target, width / height);
@@ -179,12 +252,12 @@ export class Picture {
   }
 
   #targetOf(width, height, type, samples) {
-    const { target } = this;
+    const { film: target } = this;
     if (target && target.width === width && target.height === height && target.texture.type === type) return target;
     target?.dispose();
     const filter = THREE.NearestFilter;
-    this.target = new THREE.WebGLRenderTarget(width, height, { type, samples, minFilter: filter, magFilter: filter });
-    return this.target;
+    this.film = new THREE.WebGLRenderTarget(width, height, { type, samples, minFilter: filter, magFilter: filter });
+    return this.film;
   }
 }
 
