@@ -75,7 +75,8 @@ def smooth_lobes(size: int, count: int, scale: float) -> np.ndarray:
     lobes = np.zeros((size, size, count, 7), np.float32)
     axes = start + 0.3 * turn
     lobes[..., :3] = axes / np.linalg.norm(axes, axis=-1, keepdims=True)
-    lobes[..., 3] = random.uniform(2.0, 40.0, count) * (1.0 + 0.3 * columns)
+    # The first is so wide that there is some light from everywhere.
+    lobes[..., 3] = np.array([0.5, *random.uniform(2.0, 40.0, count - 1)]) * (1.0 + 0.3 * columns)
     lobes[..., 4:] = scale * random.uniform(size=(count, 3)) * (0.6 + 0.4 * np.cos(2.0 * rows + columns)[..., None])
     return lobes
 

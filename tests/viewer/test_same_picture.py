@@ -82,7 +82,7 @@ def test_each_term_is_the_evaluator_s(name, made, serve, viewer, capture, record
     lit = [*WHOLE, Term.UNOCCLUDED] if package.environment else [Term.EMISSION, Term.DIFFUSE, Term.INTERREFLECTION]
     told = []
     with serve(folder) as url:
-        page = viewer.open(url)
+        page = viewer.open(url, viewport={"width": 320, "height": 200})
         for terms in ([WHOLE] if package.environment else [lit]) + [[term] for term in lit]:
             expected = reference.picture(terms)
             if name != "courtyard" or terms != [Term.EMISSION]:  # nothing glows there
