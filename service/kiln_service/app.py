@@ -16,7 +16,7 @@ from fastapi.responses import JSONResponse
 from kiln_schemas import __version__
 from kiln_schemas.errors import InputError
 from kiln_schemas.operators import Scope
-from kiln_service import dashboard, problems
+from kiln_service import dashboard, problems, viewer
 from kiln_service.api import blobs as blob_routes
 from kiln_service.api import health as health_routes
 from kiln_service.api import jobs as job_routes
@@ -62,6 +62,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
 
     app.state.request_seconds = RequestSeconds()
     app.state.rates = RateLimits(config.limits.rates)
+    viewer.install(app)
     dashboard.install(app)
     problems.install(app, tokens, config.limits, dashboard.error_page)
     return app

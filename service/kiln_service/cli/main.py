@@ -364,6 +364,18 @@ def verify(
 
 
 @app.command()
+def view(
+    package: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with a manifest.json.")],
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one.")] = 0,
+) -> None:
+    """Show a package in a browser, in real time; served to this machine alone, until interrupted."""
+    # Here, because only this command needs a server.
+    from kiln_service.viewer.local import view_folder
+
+    view_folder(package, port)
+
+
+@app.command()
 def doctor(
     data: Annotated[Path, typer.Option("--data", help="Folder where a bake's data would go.")] = Path(),
     json: options.Json = False,

@@ -67,12 +67,16 @@ vec3 lkGlossyDirection(LkSurface surface, vec3 o) {
   return normalize(mix(reflection.peak.z, reflection.tail.z, reflection.tailShare));
 }
 
-// Glossy reflection of the environment: U over the integral of D, 4 / (1 + alpha^2), times visibility and albedo (eq. 8).
-// u is lkEnvironmentU in lkGlossyDirection.
-vec3 lkEnvironmentReflection(sampler2DArray visibility, int count, vec2 uv, LkSurface surface, vec3 o, vec3 u) {
+// Glossy reflection of the environment as if nothing were before it: U over the integral of D, 4 / (1 + alpha^2), times
+// the albedo (eq. 4). u is lkEnvironmentU in lkGlossyDirection.
+vec3 lkEnvironmentUnoccluded(LkSurface surface, vec3 o, vec3 u) {
   float alpha = surface.roughness * surface.roughness;
-  vec3 mean = u * (0.25 * (1.0 + alpha * alpha));
-  return mean * lkLobeSum(visibility, count, uv, lkGlossyDirection(surface, o)) * lkReflectance(surface, o);
+  return u * (0.25 * (1.0 + alpha * alpha)) * lkReflectance(surface, o);
+}
+
+// The same times visibility (eq. 8).
+vec3 lkEnvironmentReflection(sampler2DArray visibility, int count, vec2 uv, LkSurface surface, vec3 o, vec3 u) {
+  return lkEnvironmentUnoccluded(surface, o, u) * lkLobeSum(visibility, count, uv, lkGlossyDirection(surface, o));
 }
 
 // The same from the GGX cube map, whose mips are means. mean is lkEnvironmentGgx in lkGlossyDirection.

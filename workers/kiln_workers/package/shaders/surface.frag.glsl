@@ -1,16 +1,36 @@
-// Fragment stage of an example program. GLSL ES 3.00; concatenate after sg.glsl, environment.glsl and lightkiln.glsl.
-// Textures of the material are left out. Define LK_ENVIRONMENT where the package has an environment.
+// Fragment stage of an example program, which lightkiln's viewer runs as it is. GLSL ES 3.00; concatenate after sg.glsl,
+// environment.glsl and lightkiln.glsl. Define LK_ENVIRONMENT where the package has an environment, and
+// LK_BASE_COLOR_MAP, LK_METALLIC_ROUGHNESS_MAP and LK_EMISSION_MAP where the material has these textures (colours are
+// sampled linear; transforms are those of KHR_texture_transform).
 
 uniform vec3 uEye;
 uniform vec4 uBaseColor;
 uniform float uMetallic;
 uniform float uRoughness;
+uniform float uRoughnessBias;  // added after the texture; 0 but to override
 uniform vec3 uEmission;
+uniform float uAlphaCutoff;
+uniform bool uDoubleSided;
+#ifdef LK_BASE_COLOR_MAP
+uniform sampler2D uBaseColorMap;
+uniform mat3 uBaseColorTransform;
+#endif
+#ifdef LK_METALLIC_ROUGHNESS_MAP
+uniform sampler2D uMetallicRoughnessMap;
+uniform mat3 uMetallicRoughnessTransform;
+#endif
+#ifdef LK_EMISSION_MAP
+uniform sampler2D uEmissionMap;
+uniform mat3 uEmissionTransform;
+#endif
 
+// Weights of the terms, 1 in the whole picture: emission, diffuse, interreflection, environment.
+uniform vec4 uTerms;
 uniform sampler2DArray uLightField;
 uniform int uLightFieldLobes;
 uniform sampler2D uIrradiance;
 #ifdef LK_ENVIRONMENT
+uniform bool uOcclusion;  // false: the environment without visibility (eq. 4), for comparison
 uniform sampler2DArray uVisibility;
 uniform int uVisibilityLobes;
 uniform sampler2DArray uEnvironmentU;
@@ -25,17 +45,46 @@ in vec2 vLightmap;
 
 out vec4 fragmentRadiance;
 
+// The shading normal on the side of the eye; the triangle's own where the interpolated one faces away.
+vec3 seenNormal(vec3 o) {
+  vec3 normal = normalize(vNormal) * (gl_FrontFacing ? 1.0 : -1.0);
+  if (dot(normal, o) > 0.0) return normal;
+  vec3 face = normalize(cross(dFdx(vPosition), dFdy(vPosition)));
+  return dot(face, o) < 0.0 ? -face : face;
+}
+
 void main() {
+  vec4 base = uBaseColor;
+  float metallic = uMetallic;
+  float roughness = uRoughness;
+  vec3 emission = uEmission;
+#ifdef LK_BASE_COLOR_MAP
+  base *= texture(uBaseColorMap, (uBaseColorTransform * vec3(vTexCoord, 1.0)).xy);
+#endif
+#ifdef LK_METALLIC_ROUGHNESS_MAP
+  vec4 glossy = texture(uMetallicRoughnessMap, (uMetallicRoughnessTransform * vec3(vTexCoord, 1.0)).xy);
+  metallic *= glossy.b;
+  roughness *= glossy.g;
+#endif
+#ifdef LK_EMISSION_MAP
+  emission *= texture(uEmissionMap, (uEmissionTransform * vec3(vTexCoord, 1.0)).xy).rgb;
+#endif
   vec3 o = normalize(uEye - vPosition);
-  LkSurface surface = LkSurface(normalize(vNormal), uBaseColor.rgb, uMetallic, uRoughness);
-  vec3 radiance = uEmission + lkDiffuse(uIrradiance, vLightmap, surface, o);
-  radiance += lkInterreflection(uLightField, uLightFieldLobes, vLightmap, surface, o);
+  vec3 normal = seenNormal(o);
+  roughness = clamp(roughness + uRoughnessBias, 0.0, 1.0);
+  LkSurface surface = LkSurface(normal, clamp(base.rgb, 0.0, 1.0), clamp(metallic, 0.0, 1.0), roughness);
+  vec3 radiance = uTerms.x * emission;
+  radiance += uTerms.y * lkDiffuse(uIrradiance, vLightmap, surface, o);
+  radiance += uTerms.z * lkInterreflection(uLightField, uLightFieldLobes, vLightmap, surface, o);
 #ifdef LK_ENVIRONMENT
   vec3 towards = lkGlossyDirection(surface, o);
-  float alpha = uRoughness * uRoughness;
-  vec3 u = lkEnvironmentU(uEnvironmentU, uEnvironmentAlphas, uEnvironmentLayers, towards, alpha);
-  radiance += lkEnvironmentReflection(uVisibility, uVisibilityLobes, vLightmap, surface, o, u);
+  vec3 u = lkEnvironmentU(uEnvironmentU, uEnvironmentAlphas, uEnvironmentLayers, towards, roughness * roughness);
+  vec3 reflected = lkEnvironmentUnoccluded(surface, o, u);
+  if (uOcclusion) reflected *= lkLobeSum(uVisibility, uVisibilityLobes, vLightmap, towards);
+  radiance += uTerms.w * reflected;
 #endif
+  if (base.a < uAlphaCutoff) discard;
+  if (!gl_FrontFacing && !uDoubleSided) radiance = vec3(0.0);
   // Linear radiance: expose, tone-map and encode in a later pass.
-  fragmentRadiance = vec4(radiance, uBaseColor.a);
+  fragmentRadiance = vec4(radiance, 1.0);
 }

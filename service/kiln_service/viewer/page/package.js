@@ -1,0 +1,125 @@
+// A package as three.js objects: scene, textures, shaders, manifest; read from the URL of its folder.
+
+import * as THREE from "../vendor/three/three.module.min.js";
+import { GLTFLoader } from "../vendor/three/GLTFLoader.js";
+
+const SHADERS = ["sg.glsl", "environment.glsl", "lightkiln.glsl", "surface.vert.glsl", "surface.frag.glsl"];
+const TEXTURES = ["lightfield.ktx2", "visibility.ktx2", "irradiance.ktx2", "environment_u.ktx2", "environment_ggx.ktx2"];
+const FORMAT_VERSION = 1;
+
+// What can be wrong with a package, in a sentence for people.
+export class PackageError extends Error {}
+
+// { manifest, meshes, textures: {name: THREE.Texture}, shaders: {name: text}, bytes }
+export async function openPackage(folder, told = () => {}) {
+  const manifest = await (await get(folder, "manifest.json")).json();
+  if (manifest.format_version > FORMAT_VERSION) {
+    throw new PackageError(`The package has format version ${manifest.format_version}; this viewer reads ${FORMAT_VERSION}. Update lightkiln.`);
+  }
+  const names = TEXTURES.filter((name) => name in manifest.textures);
+  const parts = names.length + SHADERS.length + 1;
+  let done = 0;
+  const part = async (promise) => {
+    const value = await promise;
+    told((done += 1) / parts);
+    return value;
+  };
+  const [glb, textures, ...shaders] = await Promise.all([
+    part(get(folder, "scene.glb").then((response) => response.arrayBuffer())),
+    readTextures(folder, names, part),
+    ...SHADERS.map((name) => part(get(folder, `shaders/${name}`).then((response) => response.text()))),
+  ]);
+  for (const [name, texture] of Object.entries(textures)) checkShape(name, texture, manifest.textures[name]);
+  const bytes = glb.byteLength + Object.values(textures).reduce((sum, texture) => sum + texture.fileBytes, 0);
+  return {
+    manifest,
+    bytes,
+    meshes: await readMeshes(glb),
+    textures: Object.fromEntries(Object.entries(textures).map(([name, texture]) => [name, upload(texture, name)])),
+    shaders: Object.fromEntries(SHADERS.map((name, index) => [name, shaders[index]])),
+  };
+}
+
+async function get(folder, name) {
+  const response = await fetch(folder + name);
+  if (!response.ok) throw new PackageError(`${name} cannot be read: the server answered ${response.status}.`);
+  return response;
+}
+
+// Decoded textures by name, read and decoded in one worker.
+async function readTextures(folder, names, part) {
+  const worker = new Worker(new URL("./decode.js", import.meta.url), { type: "module" });
+  const waiting = new Map();
+  worker.onmessage = ({ data }) => {
+    const { resolve, reject } = waiting.get(data.name);
+    if (data.error) reject(new PackageError(`${data.name} cannot be read: ${data.error}.`));
+    else resolve(data.texture);
+  };
+  worker.onerror = () => {
+    for (const { reject } of waiting.values()) reject(new PackageError("The decoder of textures could not start."));
+  };
+  try {
+    const entries = names.map(async (name) => {
+      const texture = new Promise((resolve, reject) => waiting.set(name, { resolve, reject }));
+      worker.postMessage({ name, url: new URL(folder + name, location.href).href });
+      return [name, await part(texture)];
+    });
+    return Object.fromEntries(await Promise.all(entries));
+  } finally {
+    worker.terminate();
+  }
+}
+
+function checkShape(name, texture, described) {
+  for (const key of ["width", "height", "layers", "faces"]) {
+    if (texture[key] !== described[key]) {
+      throw new PackageError(`${name} has ${texture[key]} as its ${key}; the manifest says ${described[key]}.`);
+    }
+  }
+}
+
+function upload({ width, height, layers, faces, levels }, name) {
+  let texture;
+  if (faces === 6) {
+    texture = new THREE.CubeTexture();
+    const plane = (level, face) => {
+      const side = Math.max(1, width >> level);
+      const length = side * side * 4;
+      return half(new THREE.DataTexture(levels[level].subarray(face * length, (face + 1) * length), side, side));
+    };
+    const cube = (level) => Array.from({ length: 6 }, (_, face) => plane(level, face));
+    texture.image = cube(0);
+    texture.mipmaps = levels.slice(1).map((_, index) => ({ image: cube(index + 1) }));
+  } else if (layers > 1) {
+    texture = new THREE.DataArrayTexture(levels[0], width, height, layers);
+  } else {
+    texture = new THREE.DataTexture(levels[0], width, height);
+  }
+  texture.minFilter = levels.length > 1 ? THREE.LinearMipmapLinearFilter : THREE.LinearFilter;
+  texture.name = name;
+  return half(texture);
+}
+
+function half(texture) {
+  texture.format = THREE.RGBAFormat;
+  texture.type = THREE.HalfFloatType;
+  texture.magFilter = THREE.LinearFilter;
+  texture.generateMipmaps = false;
+  texture.flipY = false;
+  texture.needsUpdate = true;
+  return texture;
+}
+
+// The meshes of scene.glb, in world space, as glTF's own materials describe them.
+async function readMeshes(glb) {
+  const { scene } = await new GLTFLoader().parseAsync(glb, "").catch((error) => {
+    throw new PackageError(`scene.glb cannot be read: ${error.message}.`);
+  });
+  const meshes = [];
+  scene.updateMatrixWorld(true);
+  scene.traverse((node) => node.isMesh && meshes.push(node));
+  for (const mesh of meshes) {
+    if (!mesh.geometry.attributes.uv1) throw new PackageError(`scene.glb: '${mesh.name}' has no light-map coordinates (TEXCOORD_1).`);
+  }
+  return meshes;
+}

@@ -1,0 +1,111 @@
+"""The page in a browser: controls change the picture, nothing leaves the origin, faults are said in sentences.
+
+`Viewer` fails a test whose page logs an error (a breach of the Content-Security-Policy is one) or asks another origin.
+"""
+
+import json
+
+import numpy as np
+import packages
+import pytest
+from packages import SCREENSHOTS
+from playwright.sync_api import Page
+
+from kiln_schemas import conventions
+
+SMALL = {"width": 420, "height": 260}
+
+
+def canvas(page: Page) -> str:
+    """The canvas as it is once drawn."""
+    return page.evaluate(
+        "viewer.then((picture) => { picture.finish(); return picture.renderer.domElement.toDataURL(); })"
+    )
+
+
+def change(page: Page, name: str, value: object) -> str:
+    """Set a control as a person does, wait for the frame; the canvas."""
+    page.evaluate(
+        """async ([name, value]) => {
+            const control = document.querySelector(`[name=${name}]`);
+            if (control.type === "checkbox") control.checked = value; else control.value = value;
+            control.dispatchEvent(new Event("input", { bubbles: true }));
+            await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+        }""",
+        [name, value],
+    )
+    return canvas(page)
+
+
+def test_every_control_changes_the_picture(made, serve, viewer) -> None:
+    with serve(made("courtyard")) as url:
+        page = viewer.open(f"{url}#camera={packages.CAMERAS['courtyard']}", viewport=SMALL)
+        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+        seen = [canvas(page)]
+        for name, value in {
+            "exposure": "1",
+            "tone": "neutral",
+            "lobes": "3",
+            "override": True,
+            "roughness": "0.9",
+            "grid": True,
+            "occlusion": False,
+        }.items():
+            seen.append(change(page, name, value))
+            assert seen[-1] != seen[-2], name
+        page.focus("#picture")
+        for key in ("ArrowLeft", "w"):
+            page.keyboard.press(key)
+            page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+            seen.append(canvas(page))
+            assert seen[-1] != seen[-2], key
+        page.evaluate("viewer.then((picture) => picture.pointAt(0, -0.5))")
+        assert page.evaluate("viewer.then((picture) => picture.at.length)") == 2
+        assert change(page, "sphere", True) != seen[-1]
+        page.screenshot(path=SCREENSHOTS / "controls.png")
+        with page.expect_download() as saved:
+            page.evaluate("document.getElementById('save').click()")
+        assert saved.value.suggested_filename == "courtyard.png"
+        assert saved.value.path().read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_zstd_package_draws_the_same(serve, viewer, capture, tmp_path) -> None:
+    scene = packages.cabinet_scene()
+    pictures = []
+    for compressed in (False, True):
+        folder = packages.write_package(tmp_path / str(compressed), scene, supercompress=compressed)
+        with serve(folder) as url:
+            page = viewer.open(url, viewport=SMALL)
+            camera = packages.camera("cabinet")
+            pictures.append(capture(page, camera, ["interreflection", "environment"], 48, 27, 1))
+    assert pictures[0].max() > 0.1
+    np.testing.assert_array_equal(*pictures)
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [("webgl", "has no WebGL2"), ("version", "format version 99"), ("texture", "lightfield.ktx2 cannot be read")],
+)
+def test_what_cannot_work_is_said(fault, sentence, serve, viewer, tmp_path) -> None:
+    folder = packages.write_package(tmp_path / "package", packages.cabinet_scene(), size=8, lobes=2)
+    init = ""
+    if fault == "webgl":
+        init = "HTMLCanvasElement.prototype.getContext = () => null"
+    elif fault == "version":
+        manifest = json.loads((folder / conventions.MANIFEST_JSON).read_text())
+        (folder / conventions.MANIFEST_JSON).write_text(json.dumps(manifest | {"format_version": 99}))
+    else:
+        path = folder / conventions.LIGHT_FIELD_KTX2
+        path.write_bytes(path.read_bytes()[:500])
+    with serve(folder) as url:
+        page = viewer.open(url, ready=False, init=init, viewport=SMALL)
+        page.wait_for_selector("#status[data-failed]")
+        assert sentence in page.inner_text("#status")
+
+
+def test_phone_and_dark(made, serve, viewer) -> None:
+    with serve(made("cabinet")) as url:
+        page = viewer.open(url, viewport={"width": 320, "height": 480}, color_scheme="dark")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 320
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(18, 22, 28)"
+        page.screenshot(path=SCREENSHOTS / "phone_dark.png")
