@@ -1,13 +1,14 @@
 # make demo   bake a bundled example and say where the results are
 # make test   everything that has to hold
 # make lint   the static part of it
+# make chaos  bakes under 200 faults: killed processes, cut wires, full disks (hours; tests run a few)
 # make hostile   the long run of schemathesis over the interface
 # make venv   the virtual environment in .venv that these use
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test hostile lint node chromium clean
+.PHONY: help venv demo test hostile lint node chromium chaos clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -44,6 +45,10 @@ test: lint node chromium
 
 hostile: venv
 	LIGHTKILN_HOSTILE_EXAMPLES=400 $(BIN)/pytest tests/hostile/test_openapi.py -q -rP
+
+chaos: venv
+	PYTHONPATH=tests/e2e:tests/store $(BIN)/python tests/chaos/chaos.py --store disk --faults 100 --json docs/results/chaos-disk.json
+	PYTHONPATH=tests/e2e:tests/store $(BIN)/python tests/chaos/chaos.py --store s3 --faults 100 --json docs/results/chaos-s3.json
 
 clean:
 	rm -rf $(VENV) demo demo.partial

@@ -25,6 +25,9 @@ log = logging.getLogger(__name__)
 
 QUEUED_CHANNEL: Final = "kiln_queued"
 EVENT_CHANNEL: Final = "kiln_event"
+CLAIMS_WOKEN: Final = 8
+"""Of the claims that wait, so many look for a task when one was queued, and one more for each that found one: were all
+woken, a thousand idle workers would ask the database a thousand times for every task."""
 BATCH: Final = 500
 """Events read at a time."""
 KEEPALIVE_S: Final = 15.0
@@ -93,7 +96,7 @@ class Signals:
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._waiting: dict[str, set[asyncio.Event]] = {QUEUED_CHANNEL: set(), EVENT_CHANNEL: set()}
+        self._waiting: dict[str, dict[asyncio.Event, None]] = {QUEUED_CHANNEL: {}, EVENT_CHANNEL: {}}
         self.stopping = False
 
     async def listen(self) -> None:
@@ -111,12 +114,19 @@ class Signals:
             await connection.execute(psycopg.sql.SQL("LISTEN {}").format(psycopg.sql.Identifier(channel)))
             self.wake(channel)
         async for notification in connection.notifies():
-            self.wake(notification.channel)
+            self.wake(notification.channel, CLAIMS_WOKEN if notification.channel == QUEUED_CHANNEL else None)
 
-    def wake(self, channel: str) -> None:
-        """Wake everyone who waits on the channel."""
-        for event in self._waiting[channel]:
+    def wake(self, channel: str, at_most: int | None = None) -> None:
+        """Wake who waits on the channel: all, or so many that sleep, those first that were not woken for longest."""
+        waiting = self._waiting[channel]
+        for event in [event for event in waiting if not event.is_set()][:at_most]:
             event.set()
+            del waiting[event]
+            waiting[event] = None
+
+    def claim_poll_s(self, poll_s: float) -> float:
+        """How long a waiting claim sleeps: together they look CLAIMS_WOKEN times in `poll_s`, however many they are."""
+        return poll_s * max(1.0, len(self._waiting[QUEUED_CHANNEL]) / CLAIMS_WOKEN)
 
     def stop(self) -> None:
         """End all long polls and streams: the coordinator is about to stop."""
@@ -128,8 +138,8 @@ class Signals:
     def watch(self, channel: str) -> Iterator[asyncio.Event]:
         """An event that `wake` sets, for the time of the block."""
         event = asyncio.Event()
-        self._waiting[channel].add(event)
+        self._waiting[channel][event] = None
         try:
             yield event
         finally:
-            self._waiting[channel].discard(event)
+            del self._waiting[channel][event]

@@ -87,15 +87,18 @@ class Work:
             while True:
                 woken.clear()
                 if await is_gone():
+                    self._signals.wake(QUEUED_CHANNEL, 1)
                     return None
                 found = await self._claim_once(worker_id, request.kinds)
                 if isinstance(found, Claim):
+                    # There may be more: the next one that waits looks.
+                    self._signals.wake(QUEUED_CHANNEL, 1)
                     return found
                 left = deadline - time.monotonic()
                 if left <= 0 or self._signals.stopping:
                     return None
                 if found is _NOTHING:
-                    await wait(woken, min(left, self._config.timing.poll_s))
+                    await wait(woken, min(left, self._signals.claim_poll_s(self._config.timing.poll_s)))
 
     async def _claim_once(self, worker_id: str, kinds: Sequence[TaskKind]) -> "Claim | _Outcome":
         async with self._database.transaction() as tx:
