@@ -54,15 +54,15 @@ class Farm:
         self.samples: list[tuple[str, float, float, int]] = []
         """Route, when sent (seconds of time.time), seconds until answered, status (0: no answer)."""
 
-    async def live(self, name: str, stop: asyncio.Event) -> None:
+    async def live(self, name: str, delay_s: float, stop: asyncio.Event) -> None:
         """One worker's life, until told to stop."""
         headers = {"Authorization": f"Bearer {self._token}", "Content-Type": "application/json"}
         transport = httpx.AsyncHTTPTransport(verify=False, limits=httpx.Limits(max_connections=2))
         async with httpx.AsyncClient(base_url=self._url, headers=headers, transport=transport, timeout=90) as http:
+            await asyncio.sleep(delay_s)
             registration = {"name": name, "kinds": KINDS, "memory_bytes": 2**30, "threads": 1, "device": "none"}
             welcome = await self._ask(http, "register", "/v1/workers", registration | {"version": __version__})
             me = welcome.json()
-            await asyncio.sleep(self._chance.uniform(0, 2))
             while not stop.is_set():
                 reply = await self._ask(http, "claim", f"/v1/workers/{me['worker_id']}/claim", {"kinds": KINDS})
                 if reply.status_code == 200:
@@ -153,7 +153,7 @@ class Farm:
 async def simulate(url: str, token: str, workers: int, tile_s: float, seed: int) -> None:
     """Run workers until a line comes on standard input; write what they measured to standard output."""
     farm, stop = Farm(url, token, tile_s, seed), asyncio.Event()
-    lives = [asyncio.create_task(farm.live(f"w{seed}-{i}", stop)) for i in range(workers)]
+    lives = [asyncio.create_task(farm.live(f"w{seed}-{i}", 0.06 * i, stop)) for i in range(workers)]
     told = asyncio.get_running_loop().run_in_executor(None, sys.stdin.readline)
     done, _ = await asyncio.wait([told, *lives], return_when=asyncio.FIRST_COMPLETED)  # type: ignore[type-var]
     for life in done & set(lives):  # type: ignore[operator]
@@ -227,19 +227,26 @@ class Load:
     def submit(self, tiles: int) -> str:
         """A job of so many tiles; simulated workers read their number from the name of its scene."""
         sha256 = hashlib.sha256(b"a scene").hexdigest()
-        self.http.put(f"/v1/blobs/{sha256}", content=b"a scene").raise_for_status()
+        self._insist("PUT", f"/v1/blobs/{sha256}", content=b"a scene")
         side = TILE * max(4, next(n for n in range(1, 1025) if n * n >= tiles))
         bundle = {"entry": f"{tiles}.glb", "files": {f"{tiles}.glb": sha256}}
         changes = [f"lightmap.resolution={side}", f"lightmap.tile={TILE}"]
         request = {"name": f"{tiles} tiles", "preset": "draft", "set": changes, "bundle": bundle}
-        return str(self.http.post("/v1/jobs", json=request).raise_for_status().json()["id"])
+        return str(self._insist("POST", "/v1/jobs", json=request).json()["id"])
+
+    def _insist(self, method: str, path: str, **content: Any) -> httpx.Response:
+        """The answer of a coordinator that may be too busy at first."""
+        while (reply := self.http.request(method, path, **content)).status_code == 503:
+            time.sleep(0.5)
+        return reply.raise_for_status()
 
     def follow(self, job: str) -> float:
         """Look at a job as people do until it has completed; the seconds that took."""
         began = time.monotonic()
         while True:
-            state = self.get("get job", f"/v1/jobs/{job}").raise_for_status().json()["state"]
+            view = self.get("get job", f"/v1/jobs/{job}")
             self._look()
+            state = view.json()["state"] if view.is_success else "active"
             if state not in ("queued", "active"):
                 assert state == "completed", f"job {job} is {state}"
                 return time.monotonic() - began
@@ -310,12 +317,12 @@ def _pss(process: psutil.Process) -> int:
 
 
 def quantiles(seconds: list[float]) -> dict[str, float]:
-    ordered = sorted(seconds)
+    ordered = sorted(seconds) or [float("nan")]
 
     def at(share: float) -> float:
         return round(1e3 * ordered[min(len(ordered) - 1, int(share * len(ordered)))], 1)
 
-    return {"count": len(ordered), "p50_ms": at(0.5), "p99_ms": at(0.99), "max_ms": at(1.0)}
+    return {"count": len(seconds), "p50_ms": at(0.5), "p99_ms": at(0.99), "max_ms": at(1.0)}
 
 
 def processor_s(*processes: psutil.Process) -> float:

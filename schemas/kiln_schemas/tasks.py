@@ -256,7 +256,7 @@ class WorkerWelcome(Contract):
 
 class ClaimRequest(Contract):
     kinds: tuple[TaskKind, ...] = Field(min_length=1, max_length=32)
-    wait_s: float = Field(default=10.0, ge=0, le=30)
+    wait_s: float = Field(default=25.0, ge=0, le=30)
     """Long-poll: how long the coordinator may hold the request while there is nothing to do."""
 
 

@@ -33,6 +33,8 @@ from kiln_service.planner import Planned
 
 COORDINATOR: Final = "coordinator"
 """The actor of what nobody asked for."""
+MANY_TASKS: Final = 500
+"""So many new ones change which way of finding the next is the fastest."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,8 @@ async def add_tasks(tx: Tx, job: JobRow, planned: Sequence[Planned]) -> None:
         for place, task in enumerate(planned)
     ]
     await tx.run("insert_tasks", job_id=job.id, tasks=Jsonb(rows))
+    if len(rows) >= MANY_TASKS:
+        await tx.run("analyze_tasks")
     if ready := {task.kind for task in planned if task.ready}:
         await queue.announce(tx, ready)
     counts: dict[str, int] = {}

@@ -104,7 +104,7 @@ class Work:
         async with self._database.transaction() as tx:
             worker = await _find_worker(tx, worker_id)
             found = await self._take(tx, worker, kinds)
-            await tx.run("see_worker", id=worker_id)
+            await tx.run("see_worker" if isinstance(found, Claim) else "see_worker_lightly", id=worker_id)
         return found
 
     async def _take(self, tx: Tx, worker: WorkerRow, kinds: Sequence[TaskKind]) -> "Claim | _Outcome":
@@ -139,7 +139,7 @@ class Work:
             )
             if row is not None and beat.progress is not None and beat.progress.loss is not None:
                 await tx.run("add_loss", task_id=beat.task_id, step=beat.progress.done, loss=beat.progress.loss)
-            await tx.run("see_worker", id=worker_id)
+            await tx.run("see_worker_lightly", id=worker_id)
         if row is None:
             return HeartbeatReply(stop=True, reason="the task was given to another attempt or is over")
         state = JobState(row["job_state"])

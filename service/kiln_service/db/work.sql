@@ -42,30 +42,33 @@ ORDER BY finished LIMIT 1;
 -- name: pick_task
 -- The task that a worker gets next, of all jobs or of one: of those that are queued, of its kinds, of jobs that go on
 -- and whose tags it has. Not of a job that it is blocked for, nor one that it has failed while another worker is there
--- that has not.
-SELECT tasks.id, tasks.job_id FROM tasks JOIN jobs ON jobs.id = tasks.job_id
-WHERE tasks.state IN ('queued', 'soft-failed') AND tasks.kind = ANY(%(kinds)s)
-  AND tasks.job_id = COALESCE(%(job_id)s, tasks.job_id)
-  AND jobs.state IN ('queued', 'active') AND jobs.tags <@ %(tags)s
-  AND NOT EXISTS (
-      SELECT FROM blocks
-      WHERE worker = %(worker)s AND blocks.job_id = tasks.job_id AND blocks.kind = tasks.kind AND until > now()
-  )
-  AND (
-      tasks.state = 'queued'
-      OR NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = %(worker)s)
-      OR NOT EXISTS (
-          SELECT FROM workers AS other
-          WHERE other.name <> %(worker)s AND other.seen > now() - make_interval(secs => %(stale_s)s)
-            AND other.orders = 'work' AND tasks.kind = ANY(other.kinds) AND jobs.tags <@ other.tags
-            AND NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = other.name)
-            AND NOT EXISTS (
-                SELECT FROM blocks
-                WHERE worker = other.name AND blocks.job_id = tasks.job_id AND blocks.kind = tasks.kind AND until > now()
-            )
+-- that has not. Job by job: taken together, the planner would sort all their tasks for every claim.
+SELECT best.id, best.job_id FROM jobs CROSS JOIN LATERAL (
+    SELECT tasks.id, tasks.job_id, tasks.rank, tasks.ordinal FROM tasks
+    WHERE tasks.job_id = jobs.id AND tasks.state IN ('queued', 'soft-failed') AND tasks.kind = ANY(%(kinds)s)
+      AND NOT EXISTS (
+          SELECT FROM blocks
+          WHERE worker = %(worker)s AND blocks.job_id = tasks.job_id AND blocks.kind = tasks.kind AND until > now()
       )
-  )
-ORDER BY tasks.rank DESC, tasks.job_id, tasks.ordinal
+      AND (
+          tasks.state = 'queued'
+          OR NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = %(worker)s)
+          OR NOT EXISTS (
+              SELECT FROM workers AS other
+              WHERE other.name <> %(worker)s AND other.seen > now() - make_interval(secs => %(stale_s)s)
+                AND other.orders = 'work' AND tasks.kind = ANY(other.kinds) AND jobs.tags <@ other.tags
+                AND NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = other.name)
+                AND NOT EXISTS (
+                    SELECT FROM blocks
+                    WHERE worker = other.name AND blocks.job_id = tasks.job_id AND blocks.kind = tasks.kind AND until > now()
+                )
+          )
+      )
+    ORDER BY tasks.rank DESC, tasks.ordinal
+    LIMIT 1
+) AS best
+WHERE jobs.state IN ('queued', 'active') AND jobs.tags <@ %(tags)s AND jobs.id = COALESCE(%(job_id)s, jobs.id)
+ORDER BY best.rank DESC, best.job_id, best.ordinal
 LIMIT 1;
 
 -- name: rank_tasks
@@ -150,6 +153,10 @@ SELECT result ->> 'scene' AS scene, result ->> 'texel_map' AS texel_map,
        coalesce(result -> 'between', '[]') AS between
 FROM tasks WHERE job_id = %(job_id)s AND kind = 'prepare' AND state = 'completed';
 
+-- name: analyze_tasks
+-- Tell the planner of thousands of new rows: until then it sorts them all for every claim.
+ANALYZE tasks;
+
 -- name: notify_queued
 -- Wake the claims that wait.
 SELECT pg_notify('kiln_queued', %(kinds)s);
@@ -178,6 +185,10 @@ SELECT * FROM workers WHERE id = %(id)s;
 -- name: see_worker
 -- A worker was seen now; to the second is enough.
 UPDATE workers SET seen = now() WHERE id = %(id)s AND seen < now() - interval '1 second';
+
+-- name: see_worker_lightly
+-- The same in a transaction whose loss would harm nothing: its commit does not wait for the disk.
+UPDATE workers SET seen = now() WHERE id = %(id)s AND set_config('synchronous_commit', 'off', true) = 'off';
 
 -- name: beat_task
 -- Keep an attempt alive; no row where the attempt is not the task's current one.
