@@ -1,6 +1,9 @@
-"""What routes share: the parts of the running coordinator, the caller, the errors they document."""
+"""What routes share: the parts of the running coordinator, the caller, the errors they document.
 
-from collections.abc import Callable
+Dependencies are coroutines: FastAPI would run plain functions in a thread each, which costs more than what they do.
+"""
+
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
@@ -32,19 +35,19 @@ class Parts:
 _bearer = HTTPBearer(auto_error=False, description="An access token (the file `token` of the data folder).")
 
 
-def _parts(request: Request) -> Parts:
+async def _parts(request: Request) -> Parts:
     parts = request.app.state.parts
     assert isinstance(parts, Parts)
     return parts
 
 
-def caller(scope: Scope) -> Callable[..., Principal]:
+def caller(scope: Scope) -> Callable[..., Awaitable[Principal]]:
     """A dependency: the authenticated caller, who must have the scope.
 
     Pages use it too: a browser that is signed in is known by its cookie (`kiln_service.problems.Authentication`).
     """
 
-    def check(request: Request, _: Annotated[object, Security(_bearer)]) -> Principal:
+    async def check(request: Request, _: Annotated[object, Security(_bearer)]) -> Principal:
         principal = request.scope["principal"]
         assert isinstance(principal, Principal)
         principal.require(scope)
@@ -53,10 +56,10 @@ def caller(scope: Scope) -> Callable[..., Principal]:
     return check
 
 
-def any_caller(*scopes: Scope) -> Callable[..., Principal]:
+def any_caller(*scopes: Scope) -> Callable[..., Awaitable[Principal]]:
     """A dependency: the authenticated caller, who must have one of the scopes."""
 
-    def check(request: Request, _: Annotated[object, Security(_bearer)]) -> Principal:
+    async def check(request: Request, _: Annotated[object, Security(_bearer)]) -> Principal:
         principal = request.scope["principal"]
         assert isinstance(principal, Principal)
         if not principal.scopes & set(scopes):
