@@ -1,8 +1,8 @@
 """environment_ggx.ktx2 in three.js with nothing of ours: npm's ktx-parse reads it, three.js draws it as background and
 as `envMap` of its own standard material. Directions are compared one by one, so a mirrored or turned cube is noticed.
 
-three.js' own KTX2Loader does not do: up to release 187 it makes cube maps of compressed formats only, and makes a plane of
-an uncompressed one, without complaint.
+three.js' own KTX2Loader does not do: up to release 187 it makes cube maps of compressed formats only, and makes a plane
+of an uncompressed one, without complaint.
 """
 
 import numpy as np
