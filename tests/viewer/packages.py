@@ -43,7 +43,7 @@ def write_package(
     if scene.environment is not None:
         names.append(conventions.VISIBILITY_KTX2)
     for name in names:
-        layers, _ = lobes_to_layers(smooth_lobes(size, lobes, 2.0 if name == names[0] else 0.3))
+        layers, _ = lobes_to_layers(smooth_lobes(size, lobes, 2.0 if name == names[0] else 1.0))
         write(name, ktx2.texture_array(np.tile(layers, (1, tiles, tiles, 1)), {}), lobes=lobes)
     rows, columns = np.indices((size * tiles,) * 2) / size
     irradiance = np.stack([3.0 * columns + 0.1, 2.0 * rows + 0.1, 1.5 - np.sin(columns)], axis=-1).astype(np.float32)
