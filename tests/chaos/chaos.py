@@ -10,6 +10,7 @@ the undisturbed one, every task must have been completed once.
 
 import argparse
 import contextlib
+import itertools
 import json
 import os
 import random
@@ -20,6 +21,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -33,7 +35,14 @@ from faulty_proxy import FaultyProxy
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.scene.examples import write_exr
 
+SMALL = (
+    *("lightmap.tile=4", "render.irradiance_samples=16", "fit.lobes=4", "fit.start_steps=60"),
+    *("fit.visibility_steps=60", "fit.refine_steps=20", "fit.checkpoint_s=1"),
+)
+"""Tasks so short that the time to the next one committed is that of the recovery and not of the task."""
 OVER = ("completed", "gate-failed", "failed", "canceled")
+SLOW_S = 30.0
+"""Of a recovery that takes longer the job's history is printed."""
 GIVEN_UP_S = 180.0
 """A fault after which nothing is committed for so long was not recovered from."""
 
@@ -50,6 +59,7 @@ class Bench:
         self.verdicts: Counter[str] = Counter(
             dict.fromkeys(("bakes", "bakes_differ", "bakes_failed", "tiles_lost", "tiles_doubled", "not_recovered"), 0)
         )
+        self.undisturbed: dict[str, float] = {}
         self._job = ""
         self._expected: dict[str, str] = {}
         (folder / "room.glb").write_bytes(encode_glb(room()))
@@ -105,10 +115,15 @@ class Bench:
         seconds = time.monotonic() - began
         self.recoveries.append((kind, seconds))
         print(f"{len(self.recoveries):4d} {kind:20} recovered in {seconds:5.1f} s", file=sys.stderr, flush=True)
+        if seconds > SLOW_S:
+            for event in self._events(self._job):
+                age = time.time() - datetime.fromisoformat(event["at"]).timestamp()
+                if age < seconds + SLOW_S:
+                    print(f"     {seconds - age:7.1f} s  {event['kind']} {event['detail']}", file=sys.stderr)
 
     def _submit(self) -> None:
         files = (self._folder / "room.glb", self._folder / "sky.exr")
-        self._job = self.farm.submit(*files, *settings("fit.checkpoint_s=1"))
+        self._job = self.farm.submit(*files, *settings(*SMALL))
 
     def _settle(self, *, wait: bool) -> None:
         """Judge the bake that is over and begin another; with `wait` wait for its end and begin none."""
@@ -125,6 +140,8 @@ class Bench:
             self.verdicts["tiles_lost"] += sum(
                 task["state"] != "completed" or not completed[task["id"]] for task in tasks
             )
+            if not self._expected:
+                self.undisturbed = pace(events)
             got = digests(self.farm.download(self._job, self._folder / f"package-{self._job}"))
             self._expected = self._expected or got
             self.verdicts["bakes_differ"] += got != self._expected
@@ -174,6 +191,13 @@ class Bench:
         ballast.unlink()
 
 
+def pace(events: list[dict[str, Any]]) -> dict[str, float]:
+    """Seconds from a job's first task to its last, and the longest between two committed tasks."""
+    times = [datetime.fromisoformat(event["at"]) for event in events if event["kind"] == "task.completed"]
+    gaps = [(after - before).total_seconds() for before, after in itertools.pairwise(times)]
+    return {"tasks": len(times), "seconds": sum(gaps), "longest_gap_s": max(gaps)}
+
+
 @contextlib.contextmanager
 def bench(folder: Path, store: str, seed: int) -> Iterator[Bench]:
     """A bench on a store in a bucket ("s3"), or on a small disk ("disk"; never full where none can be mounted)."""
@@ -211,6 +235,7 @@ def report(bench: Bench, seed: int, store: str) -> dict[str, Any]:
         "store": store,
         "timing": TIMING | {"restart_s": RESTART_S},
         "load_average": os.getloadavg()[2],
+        "undisturbed": bench.undisturbed,
         "faults": {
             kind: {"count": len(found), "median_s": statistics.median(found), "worst_s": max(found)}
             for kind, found in by_kind.items()
@@ -223,7 +248,10 @@ def report(bench: Bench, seed: int, store: str) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> str:
     rows = [
-        f"seed {result['seed']}, store {result['store']}",
+        f"seed {result['seed']}, store {result['store']}, load average {result['load_average']:.1f}",
+        "undisturbed: {tasks} tasks in {seconds:.1f} s, {longest_gap_s:.1f} s between two at most".format(
+            **result["undisturbed"]
+        ),
         f"{'fault':24} {'count':>6} {'median s':>9} {'worst s':>9}",
     ]
     for kind, row in (result["faults"] | {"all": result["all"]}).items():

@@ -16,6 +16,7 @@ import zarr
 from kiln_schemas.errors import Conflict, InputError, InternalError, MachineLacks, NotFound
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
+from kiln_workers.store import location
 from kiln_workers.store.light_field import LightFieldStore
 
 R, TILE, SHAPE = 16, 8, (20, 24)
@@ -188,6 +189,7 @@ def test_full_disk_names_the_store_and_leaves_the_old_shard(url: str) -> None:
 _WRITER = """
 import sys, numpy as np
 from kiln_schemas.tasks import Tile
+from kiln_workers.store import location
 from kiln_workers.store.light_field import LightFieldStore
 store = LightFieldStore.open(sys.argv[1])
 tile = Tile(row=0, column=0, size=store.tile_size, texels=64)
@@ -240,3 +242,23 @@ def test_the_group_document_is_json_with_sorted_keys(url: str) -> None:
     text = (folder(url) / "zarr.json").read_text()
     assert json.dumps(json.loads(text), indent=1, sort_keys=True) == text
     assert not list(folder(url).rglob("*__lock"))
+
+
+def test_a_disk_that_is_full_for_a_while_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(location, "PAUSE_S", (0.0, 0.0))
+    said = ["No space left on device", "Disk quota exceeded", ""]
+
+    def write() -> None:
+        if words := said.pop(0):
+            raise ValueError(f"RESOURCE_EXHAUSTED: {words}")
+
+    location.write_patiently("file:///store", write)
+    assert said == []
+    for given_up in ("File too large", "Permission denied"):
+        said[:] = [given_up]
+        with pytest.raises(MachineLacks):
+            location.write_patiently("file:///store", write)
+    monkeypatch.setattr(location, "FULL_PATIENCE_S", -1.0)
+    said[:] = ["No space left on device"]
+    with pytest.raises(MachineLacks, match="cannot take more data"):
+        location.write_patiently("file:///store", write)

@@ -19,7 +19,7 @@ from kiln_schemas.errors import Conflict, InputError, InternalError, NotFound
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.store import layout
-from kiln_workers.store.location import kvstore_spec, translated_errors
+from kiln_workers.store.location import kvstore_spec, translated_errors, write_patiently
 
 Float16 = npt.NDArray[np.float16]
 Float32 = npt.NDArray[np.float32]
@@ -95,8 +95,7 @@ class LightFieldStore:
             raise InternalError(f"texel map arrays are {sorted(layout.TEXEL_MAP_ARRAYS)}, not {sorted(arrays)}")
         for name, values in arrays.items():
             self._refuse_not_finite(values, name)
-            with translated_errors(self.url):
-                self._array(name)[...].write(values.astype(layout.TEXEL_MAP_ARRAYS[name][0])).result()
+            self._write_array(name, values.astype(layout.TEXEL_MAP_ARRAYS[name][0]))
 
     def read_texel_map(self) -> dict[str, npt.NDArray[Any]]:
         """The arrays of `write_texel_map`."""
@@ -161,11 +160,19 @@ class LightFieldStore:
                 )
             return np.asarray(array[rows, columns].read().result())
 
+    def _write_array(self, name: str, values: npt.NDArray[Any]) -> None:
+        array = self._array(name)
+        write_patiently(self.url, lambda: array[...].write(values).result())
+
     def _write_texels(self, name: str, tile: Tile, covered: Index, values: npt.NDArray[Any]) -> None:
         rows, columns = self._positions(tile, covered)
         array = self._array(name)
-        with translated_errors(self.url), ts.Transaction() as transaction:
-            array.with_transaction(transaction)[rows, columns].write(values).result()
+
+        def write() -> None:
+            with ts.Transaction() as transaction:
+                array.with_transaction(transaction)[rows, columns].write(values).result()
+
+        write_patiently(self.url, write)
 
     def _positions(self, tile: Tile, covered: Index) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         aligned = tile.row % self.tile_size == 0 and tile.column % self.tile_size == 0 and tile.size == self.tile_size

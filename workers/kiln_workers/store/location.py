@@ -5,14 +5,24 @@ tensorstore reports every failure as ValueError whose text starts with an absl s
 which those become `kiln_schemas.errors`.
 """
 
+import logging
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
 from kiln_schemas.errors import Conflict, InputError, KilnError, MachineLacks
 
+log = logging.getLogger(__name__)
+
+FULL_PATIENCE_S: Final = 60.0
+"""A full disk is tried again for so long: all of a farm's attempts at a task would otherwise end in seconds."""
+PAUSE_S: Final = (0.5, 5.0)
+"""First and longest pause between two tries."""
+_PASSING = ("No space left", "Disk quota")
+"""What ends when somebody frees space; a file's greatest size, for one, does not."""
 _DISK = ("No space left", "File too large", "Disk quota", "RESOURCE_EXHAUSTED")
 _DENIED = ("PERMISSION_DENIED", "Permission denied", "Read-only file system", "AccessDenied", "InvalidAccessKeyId")
 
@@ -51,6 +61,22 @@ def translated_errors(url: str) -> Iterator[None]:
         yield
     except (ValueError, OSError, NotImplementedError) as error:
         raise _translate(url, str(error)) from error
+
+
+def write_patiently(url: str, write: Callable[[], object]) -> None:
+    """Call `write`, which may be repeated, until the disk of the store has space for it or the patience is over."""
+    deadline, pause = time.monotonic() + FULL_PATIENCE_S, PAUSE_S[0]
+    while True:
+        try:
+            with translated_errors(url):
+                write()
+            return
+        except MachineLacks as error:
+            if time.monotonic() > deadline or not any(sign in error.detail for sign in _PASSING):
+                raise
+            log.warning("%s; trying again", error.detail)
+        time.sleep(pause)
+        pause = min(2 * pause, PAUSE_S[1])
 
 
 def _translate(url: str, text: str) -> KilnError:
