@@ -16,6 +16,7 @@ export async function start() {
   const opened = await openPackage(document.body.dataset.package, (share) => {
     status.textContent = `Loading the package … ${Math.round(100 * share)} %`;
   });
+  performance.mark("package read");
   const picture = new Picture(canvas, opened);
   picture.setCamera(startCamera(picture.bounds, location.hash));
   form.hidden = false;
