@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Collection, Iterator
 from typing import Any, Final
 
 import psycopg
@@ -96,7 +96,7 @@ class Signals:
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._waiting: dict[str, dict[asyncio.Event, None]] = {QUEUED_CHANNEL: {}, EVENT_CHANNEL: {}}
+        self._waiting: dict[str, dict[asyncio.Event, frozenset[str]]] = {QUEUED_CHANNEL: {}, EVENT_CHANNEL: {}}
         self.stopping = False
 
     async def listen(self) -> None:
@@ -114,15 +114,21 @@ class Signals:
             await connection.execute(psycopg.sql.SQL("LISTEN {}").format(psycopg.sql.Identifier(channel)))
             self.wake(channel)
         async for notification in connection.notifies():
-            self.wake(notification.channel, CLAIMS_WOKEN if notification.channel == QUEUED_CHANNEL else None)
+            if notification.channel == QUEUED_CHANNEL:
+                self.wake(QUEUED_CHANNEL, CLAIMS_WOKEN, notification.payload.split(","))
+            else:
+                self.wake(notification.channel)
 
-    def wake(self, channel: str, at_most: int | None = None) -> None:
-        """Wake who waits on the channel: all, or so many that sleep, those first that were not woken for longest."""
+    def wake(self, channel: str, at_most: int | None = None, about: Collection[str] = ()) -> None:
+        """Wake who sleeps on the channel, or `at_most` of them: those first that were not woken for longest.
+
+        Where it is said what it is `about`, only those that wait for some of it.
+        """
         waiting = self._waiting[channel]
-        for event in [event for event in waiting if not event.is_set()][:at_most]:
+        concerned = (event for event, wanted in waiting.items() if not about or not wanted.isdisjoint(about))
+        for event in [event for event in concerned if not event.is_set()][:at_most]:
             event.set()
-            del waiting[event]
-            waiting[event] = None
+            waiting[event] = waiting.pop(event)
 
     def claim_poll_s(self, poll_s: float) -> float:
         """How long a waiting claim sleeps: together they look CLAIMS_WOKEN times in `poll_s`, however many they are."""
@@ -135,10 +141,10 @@ class Signals:
             self.wake(channel)
 
     @contextlib.contextmanager
-    def watch(self, channel: str) -> Iterator[asyncio.Event]:
-        """An event that `wake` sets, for the time of the block."""
+    def watch(self, channel: str, wanted: Collection[str] = ()) -> Iterator[asyncio.Event]:
+        """An event that `wake` sets, for the time of the block; for the queue, by tasks of the kinds `wanted`."""
         event = asyncio.Event()
-        self._waiting[channel][event] = None
+        self._waiting[channel][event] = frozenset(wanted)
         try:
             yield event
         finally:

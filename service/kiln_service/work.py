@@ -83,16 +83,16 @@ class Work:
         `is_gone` tells whether the worker hung up: a task given to nobody would wait for the reaper.
         """
         deadline = time.monotonic() + request.wait_s
-        with self._signals.watch(QUEUED_CHANNEL) as woken:
+        with self._signals.watch(QUEUED_CHANNEL, request.kinds) as woken:
             while True:
                 woken.clear()
                 if await is_gone():
-                    self._signals.wake(QUEUED_CHANNEL, 1)
+                    self._signals.wake(QUEUED_CHANNEL, 1, request.kinds)
                     return None
                 found = await self._claim_once(worker_id, request.kinds)
                 if isinstance(found, Claim):
                     # There may be more: the next one that waits looks.
-                    self._signals.wake(QUEUED_CHANNEL, 1)
+                    self._signals.wake(QUEUED_CHANNEL, 1, [found.payload.kind])
                     return found
                 left = deadline - time.monotonic()
                 if left <= 0 or self._signals.stopping:

@@ -1,11 +1,14 @@
 """Which worker gets which task: tags, tasks that failed elsewhere, blocks, sleep schedules."""
 
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, time, timedelta
+from time import monotonic, sleep
 
 import pytest
 from pydantic import ValidationError
 
 from kiln_schemas.operators import DAYS, SleepSchedule
+from kiln_service.events import CLAIMS_WOKEN
 from kiln_service.schedules import sleeps_at
 
 
@@ -181,3 +184,19 @@ def test_a_schedule_follows_the_local_clock():
     assert sleeps_at(schedule, datetime(2026, 12, 2, 13, 30, tzinfo=UTC))
     with pytest.raises(ValidationError):
         SleepSchedule(days=("wed",), begins=time(8), ends=time(9), timezone="")
+
+
+def test_a_task_wakes_a_worker_of_its_kind_among_many_that_wait(home):
+    """Only some waiting claims are woken for a task: none of another kind takes their place."""
+    others = [home.worker(f"other {number}") for number in range(3 * CLAIMS_WOKEN)]
+    one, found = home.worker("one"), []
+    with ThreadPoolExecutor(len(others) + 1) as pool:
+        waiting = [pool.submit(other.claim, "package", wait_s=4) for other in others]
+        sleep(0.5)
+        waiting.append(pool.submit(lambda: found.append(one.claim("prepare", wait_s=4))))
+        sleep(0.5)
+        began = monotonic()
+        home.submit()
+        waiting[-1].result()
+        assert found[0] is not None and monotonic() - began < 2.5, "before it looked by itself"
+        assert [claim.result() for claim in waiting[:-1]] == [None] * len(others)
