@@ -5,6 +5,7 @@ from typing import Any
 from pydantic import Field
 
 from kiln_schemas.base import Contract
+from kiln_schemas.camera import Camera
 from kiln_schemas.gates import GateResult
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.tasks import Artifact, EnvironmentRef, FitMetrics, Sha256
@@ -15,6 +16,14 @@ class ManifestMetrics(Contract):
 
     light_field: FitMetrics | None
     visibility: FitMetrics | None
+
+
+class ReferenceView(Contract):
+    """Where a path-traced picture of the package was seen from, for comparison."""
+
+    camera: Camera
+    white: float = Field(gt=0.0)
+    """Luminance that it shows as white."""
 
 
 class Manifest(Contract):
@@ -36,6 +45,8 @@ class Manifest(Contract):
     metrics: ManifestMetrics
     gates: tuple[GateResult, ...] = ()
     """The quality gates that the job stated, measured."""
+    views: dict[str, ReferenceView] = Field(default_factory=dict)
+    """Of `gates/NAME_reference.png`, by NAME."""
     left_out: dict[str, str] = Field(default_factory=dict)
     """Artifact or function to the reason why it is absent."""
     textures: dict[str, dict[str, Any]]

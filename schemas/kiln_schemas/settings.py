@@ -97,6 +97,7 @@ class PackageSettings(Contract):
     """What is written besides the textures."""
 
     environment_size: int = Field(default=128, ge=16, le=1024, description="side of the GGX cube's largest mip")
+    supercompress: bool = Field(default=False, description="Zstandard inside the lobe textures")
 
 
 class BakeSettings(Contract):

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kiln_schemas.camera import Camera
 from kiln_schemas.gates import GateResult
-from kiln_schemas.manifest import Manifest
+from kiln_schemas.manifest import Manifest, ReferenceView
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import CurvePoint
 from kiln_workers.package import charts, report
@@ -97,14 +98,16 @@ def test_gates_and_what_they_compared_are_shown(make_sample, tmp_path: Path, rea
     random = np.random.default_rng(5)
     picture, reference = (random.integers(0, 256, (9, 16, 3), dtype=np.uint8) for _ in range(2))
     results = (GateResult.of("log_mse_rel", 0.1, 0.2), GateResult.of("flip.front", 0.123, 0.08, noise_floor=0.0456))
+    seen = ReferenceView(camera=Camera(position=(0, 1, 3), target=(0, 0, 0), fov_deg=45), white=2.0)
     judged = []
 
     def judge(folder: Path, manifest: Manifest) -> Judgement:
         judged.append((sorted(path.name for path in folder.iterdir()), manifest))
-        return Judgement(results, (View("front", picture, reference),))
+        return Judgement(results, (View("front", seen, picture, reference),))
 
     artifacts = build_package(tmp_path, make_sample().given, judge)
     ((files, manifest),) = judged
+    assert Manifest.model_validate_json((tmp_path / "manifest.json").read_bytes()).views == {"front": seen}
     assert "lightfield.ktx2" in files and "scene.glb" in files and "manifest.json" not in files
     assert manifest.gates == () and "lightfield.ktx2" in manifest.textures
     assert Manifest.model_validate_json((tmp_path / "manifest.json").read_bytes()).gates == results

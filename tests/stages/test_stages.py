@@ -50,7 +50,7 @@ GATES = Gates(log_mse_rel=1e-6, visibility_log_mse_rel=0.5, flip={"front": 0.6})
 @pytest.fixture(scope="module")
 def baked(tmp_path_factory: pytest.TempPathFactory) -> Baked:
     scene = replace(room(), environment=Environment(sky()))
-    settings = make_settings("draft", TINY)
+    settings = make_settings("draft", [*TINY, "package.supercompress=true"])
     return bake(tmp_path_factory.mktemp("stages"), scene, settings, gates=GATES, cameras={"front": FRONT})
 
 
@@ -178,6 +178,14 @@ def test_a_dark_scene_is_refused(baked: Baked) -> None:
 def downloaded(baked: Baked, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package as a client has it."""
     return baked.download(tmp_path_factory.mktemp("downloaded"))
+
+
+def test_lobes_are_compressed_where_the_settings_say_so(downloaded: Path) -> None:
+    manifest = read_manifest(downloaded)
+    for name in ("lightfield.ktx2", "visibility.ktx2"):
+        assert manifest.textures[name]["supercompression"] == "zstd"
+        scheme = int.from_bytes((downloaded / name).read_bytes()[44:48], "little")
+        assert scheme == 2
 
 
 def test_gates_are_in_the_result_the_manifest_and_the_files(baked: Baked, downloaded: Path) -> None:

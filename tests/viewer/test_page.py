@@ -6,12 +6,19 @@
 import json
 
 import numpy as np
+import OpenImageIO as oiio
 import packages
 import pytest
+import torch
 from packages import SCREENSHOTS
 from playwright.sync_api import Page
 
 from kiln_schemas import conventions
+from kiln_schemas.manifest import Manifest, ReferenceView
+from kiln_workers.package import colour, png
+from kiln_workers.shade.gbuffer import render_gbuffer
+from kiln_workers.shade.package import ShadePackage
+from kiln_workers.shade.picture import shade
 
 SMALL = {"width": 420, "height": 260}
 
@@ -109,3 +116,34 @@ def test_phone_and_dark(made, serve, viewer) -> None:
         assert page.evaluate("document.documentElement.scrollWidth") <= 320
         assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(18, 22, 28)"
         page.screenshot(path=SCREENSHOTS / "phone_dark.png")
+
+
+def test_the_reference_lies_over_the_same_picture(serve, viewer, tmp_path) -> None:
+    """The reference is the evaluator's own picture here, so both sides of the slider look alike wherever it is."""
+    folder = packages.write_package(tmp_path / "package", packages.cabinet_scene())
+    camera = packages.camera("cabinet")
+    package = ShadePackage.read(folder, torch.device("cpu"))
+    picture = shade(package, render_gbuffer(package.scene, camera, 480, 270, 2, "cpu"))
+    white = colour.white_point(picture)
+    (folder / "gates").mkdir()
+    (folder / "gates" / "front_reference.png").write_bytes(png.encode(colour.tone_map(picture, white)))
+    manifest = Manifest.model_validate_json((folder / conventions.MANIFEST_JSON).read_text())
+    views = {"front": ReferenceView(camera=camera, white=white)}
+    (folder / conventions.MANIFEST_JSON).write_text(manifest.model_copy(update={"views": views}).model_dump_json())
+    with serve(folder) as url:
+        page = viewer.open(url, viewport={"width": 730, "height": 320})
+        seen = []
+        for split in ("100", "0", "50"):
+            change(page, "view", "front")
+            change(page, "split", split)
+            page.wait_for_function("document.querySelector('#reference img').complete")
+            path = SCREENSHOTS / f"compared_{split}.png"
+            page.locator(".stage").screenshot(path=path)
+            seen.append(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)[..., :3].astype(np.float64))
+    assert seen[0].shape[0] > 200
+    assert seen[0].std() > 0.1
+    for other in seen[1:]:
+        assert np.any(seen[0] != other)
+        assert 10.0 * np.log10(1.0 / np.mean(np.square(seen[0] - other))) > 28.0
+    # A reference from elsewhere would be noticed.
+    assert 10.0 * np.log10(1.0 / np.mean(np.square(seen[0] - np.roll(seen[1], 8, axis=1)))) < 28.0

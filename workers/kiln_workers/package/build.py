@@ -278,6 +278,7 @@ def _manifest(package: _Package) -> Manifest:
             light_field=given.metrics.get(Function.LIGHT_FIELD), visibility=given.metrics.get(Function.VISIBILITY)
         ),
         gates=package.judgement.results,
+        views={view.camera: view.seen for view in package.judgement.views},
         left_out=_left_out(given),
         textures=package.textures,
         lightmap=_lightmap(given.texel_map),

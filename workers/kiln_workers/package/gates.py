@@ -9,6 +9,7 @@ import numpy.typing as npt
 from kiln_schemas.conventions import GATES_FOLDER, GATES_XML
 from kiln_schemas.gates import REFERENCE_SUFFIX, GateResult
 from kiln_schemas.junit import junit
+from kiln_schemas.manifest import ReferenceView
 from kiln_workers.package import png
 from kiln_workers.package.files import write_bytes
 
@@ -20,6 +21,7 @@ class View:
     """What the package shows from a camera, and what it should; display colours [H, W, 3] with one white point."""
 
     camera: str
+    seen: ReferenceView
     picture: UInt8
     reference: UInt8
 

@@ -19,7 +19,7 @@ import torch
 from kiln_schemas.camera import Camera
 from kiln_schemas.errors import InputError
 from kiln_schemas.gates import FLIP, LOG_MSE_REL, VISIBILITY_LOG_MSE_REL, GateResult
-from kiln_schemas.manifest import Manifest
+from kiln_schemas.manifest import Manifest, ReferenceView
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import FitMetrics, PackagePayload
 from kiln_workers.package import colour
@@ -91,7 +91,8 @@ class GateJudge:
         value = flip(reference, picture)
         result = GateResult.of(FLIP + name, value, threshold, flip_of_halves=flip_of_halves, noise_floor=noise)
         white = colour.white_point(reference)
-        view = View(name, colour.tone_map(picture, white), colour.tone_map(reference, white))
+        seen = ReferenceView(camera=camera, white=white)
+        view = View(name, seen, colour.tone_map(picture, white), colour.tone_map(reference, white))
         return result, view
 
 

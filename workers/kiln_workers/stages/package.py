@@ -87,6 +87,7 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
             environment=environment,
             stage_seconds=_stage_seconds(payload, time.perf_counter() - began),
             versions=_versions(),
+            supercompress=payload.settings.package.supercompress,
         ),
         judge,
     )

@@ -31,13 +31,19 @@ export class Navigation {
     this.step = STEP * picture.bounds.getSize(new THREE.Vector3()).length();
     this.walking = false;
     this.orbit = new OrbitControls(this.camera, canvas);
-    this.orbit.target.copy(picture.target);
-    this.orbit.update();
+    this.target = () => picture.target;
+    this.follow();
     this.orbit.addEventListener("change", redraw);
     canvas.addEventListener("keydown", (event) => this.#key(event));
     canvas.addEventListener("pointermove", (event) => {
       if (this.walking && event.buttons) this.#turn(DRAG * event.movementX, DRAG * event.movementY);
     });
+  }
+
+  // Take the place where the picture's camera has been put.
+  follow() {
+    this.orbit.target.copy(this.target());
+    this.orbit.update();
   }
 
   setWalking(walking) {

@@ -3,6 +3,7 @@
 import { Navigation, startCamera } from "./navigation.js";
 import { PackageError, openPackage } from "./package.js";
 import { Picture } from "./picture.js";
+import { Reference } from "./reference.js";
 
 const status = document.getElementById("status");
 const canvas = document.getElementById("picture");
@@ -16,14 +17,17 @@ export async function start() {
   const opened = await openPackage(document.body.dataset.package, (share) => {
     status.textContent = `Loading the package … ${Math.round(100 * share)} %`;
   });
+  performance.mark("package read");
   const picture = new Picture(canvas, opened);
   picture.setCamera(startCamera(picture.bounds, location.hash));
   form.hidden = false;
   offerControls(picture);
+  const reference = new Reference(picture, form);
   const redraw = drawWhenAsked(picture);
   const navigation = new Navigation(picture, canvas, redraw);
-  form.addEventListener("input", () => {
-    obey(picture, navigation);
+  form.addEventListener("input", ({ target }) => {
+    if (target.name === "view" && reference.choose()) navigation.follow();
+    obey(picture, navigation, reference);
     redraw();
   });
   form.addEventListener("submit", (event) => event.preventDefault());
@@ -34,7 +38,7 @@ export async function start() {
     redraw();
   });
   new ResizeObserver(redraw).observe(canvas);
-  obey(picture, navigation);
+  obey(picture, navigation, reference);
   drawNow(picture);
   picture.firstFrame = { milliseconds: performance.now() - began, bytes: opened.bytes };
   status.textContent = `${(opened.bytes / 2 ** 20).toFixed(1)} MiB, drawn after ${(picture.firstFrame.milliseconds / 1000).toFixed(1)} s`;
@@ -49,11 +53,12 @@ function offerControls(picture) {
 }
 
 // What the controls say, put into the picture.
-function obey(picture, navigation) {
+function obey(picture, navigation, reference) {
   const { exposure, tone, lobes, override, roughness, grid, sphere, walk, occlusion, stops, count, rough } = form.elements;
   const terms = [...form.querySelectorAll("[name=term]:checked")].map((input) => input.value);
   picture.setTerms(terms.map((term) => (term === "environment" && !occlusion.checked ? "unoccluded" : term)));
-  picture.exposure = 2 ** Number(exposure.value);
+  picture.exposure = reference.exposure * 2 ** Number(exposure.value);
+  reference.split();
   picture.toneMap = tone.value;
   picture.setLobes(Number(lobes.value));
   picture.setRoughness(override.checked ? Number(roughness.value) : null);
