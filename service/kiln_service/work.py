@@ -250,14 +250,18 @@ class Work:
                 await transitions.requeue_task(tx, task, kind, actor, strike=strike, reason=reason)
                 return
         await transitions.fail_task(tx, task, problem, actor)
-        if final or await self._too_many_failed(tx, job, task):
+        if final or await self._fails_with(tx, job, task):
             await transitions.fail_job(tx, job, problem, actor)
 
-    async def _too_many_failed(self, tx: Tx, job: JobRow, task: TaskRow) -> bool:
-        """Whether the job fails with this task: nothing else can be done for it, or its other tasks would fail too."""
-        row = await tx.one("failed_share", job_id=job.id, kind=task.kind)
-        share = self._config.failed_tasks
-        return not row["open"] or (row["failed"] >= share.least and row["failed"] > share.of_all * row["total"])
+    async def _fails_with(self, tx: Tx, job: JobRow, task: TaskRow) -> bool:
+        """Whether the job fails with this task: nothing is left to do for it, or the rest would fail as well.
+
+        That is to be expected where many have failed, or the first of all on the only worker there is.
+        """
+        stale_s, share = self._config.timing.stale_s, self._config.failed_tasks
+        row = await tx.one("failed_share", job_id=job.id, kind=task.kind, worker_id=task.worker_id, stale_s=stale_s)
+        many = row["failed"] >= share.least and row["failed"] > share.of_all * row["total"]
+        return not row["open"] or many or not (row["completed"] or row["others"])
 
 
 class _Outcome:

@@ -94,10 +94,11 @@ def test_an_input_error_is_final(home):
 def test_a_failed_task_leaves_the_others_to_go_on(home):
     job, worker = home.submit(), home.worker()
     worker.finish(worker.must_claim(), tiles=4)
+    worker.finish(worker.must_claim("render"))
     poison = worker.must_claim("render")
     worker.fail(poison, retryable=False).raise_for_status()
     assert home.job(job["id"])["state"] == "active"
-    for _ in range(3):
+    for _ in range(2):
         worker.finish(worker.must_claim("render"))
     failed = home.job(job["id"])
     assert failed["state"] == "failed" and failed["error"]["detail"] == "it broke"
@@ -108,13 +109,29 @@ def test_a_failed_task_leaves_the_others_to_go_on(home):
 
 def test_a_job_with_failed_tasks_can_be_mended_while_it_goes_on(home):
     job, worker = home.submit(), home.worker()
-    worker.finish(worker.must_claim(), tiles=2)
+    worker.finish(worker.must_claim(), tiles=3)
+    worker.finish(worker.must_claim("render"))
     worker.fail(worker.must_claim("render"), retryable=False).raise_for_status()
     home.client.post(f"/v1/jobs/{job['id']}/retry").raise_for_status()
     assert home.client.post(f"/v1/jobs/{job['id']}/retry").status_code == 409
     while claim := worker.claim():
         worker.finish(claim)
     assert home.job(job["id"])["state"] == "completed"
+
+
+def test_a_job_fails_with_its_first_tile_where_nobody_else_could_do_the_others(home):
+    """The only worker has no disk, say: to let every tile fail on it would take long and help nobody."""
+    job, worker = home.submit(), home.worker("only")
+    worker.finish(worker.must_claim(), tiles=4)
+    worker.fail(worker.must_claim("render"), retryable=False).raise_for_status()
+    assert home.job(job["id"])["state"] == "failed"
+    other, helper = home.submit(set=["render.samples=9"]), home.worker("helper")
+    worker.finish(worker.must_claim("prepare"), tiles=4)
+    worker.fail(worker.must_claim("render"), retryable=False).raise_for_status()
+    assert home.job(other["id"])["state"] == "active"
+    while claim := helper.claim("render"):
+        helper.finish(claim)
+    assert home.job(other["id"])["state"] == "failed"
 
 
 def test_an_input_error_of_a_tile_stops_its_job(home):
@@ -133,6 +150,7 @@ def test_a_job_of_which_too_many_tasks_fail_fails_at_once(start):
     with start(failed_tasks=FailedTasks(least=3, of_all=0.2)) as home:
         job, worker = home.submit(), home.worker()
         worker.finish(worker.must_claim(), tiles=16)
+        worker.finish(worker.must_claim("render"))
         for state in ("active", "active", "active", "failed"):
             worker.fail(worker.must_claim("render"), retryable=False).raise_for_status()
             assert home.job(job["id"])["state"] == state

@@ -23,10 +23,17 @@ SELECT EXISTS (
 SELECT id, kind, label, state, spec FROM tasks WHERE job_id = %(job_id)s AND kind = ANY(%(kinds)s) ORDER BY ordinal;
 
 -- name: failed_share
--- Of a job's tasks of a kind: how many there are, how many failed; and whether any of the job can still be worked on.
+-- Of a job's tasks of a kind: how many there are, have failed, have completed; how many of the job can still be worked
+-- on; and whether another worker than one is there for the kind.
 SELECT count(*) FILTER (WHERE kind = %(kind)s) AS total,
        count(*) FILTER (WHERE kind = %(kind)s AND state = 'failed') AS failed,
-       count(*) FILTER (WHERE state IN ('queued', 'soft-failed', 'active')) AS open
+       count(*) FILTER (WHERE kind = %(kind)s AND state = 'completed') AS completed,
+       count(*) FILTER (WHERE state IN ('queued', 'soft-failed', 'active')) AS open,
+       EXISTS (
+           SELECT FROM workers AS other, workers AS one
+           WHERE one.id = %(worker_id)s AND other.name <> one.name AND other.orders = 'work'
+             AND other.seen > now() - make_interval(secs => %(stale_s)s) AND %(kind)s = ANY(other.kinds)
+       ) AS others
 FROM tasks WHERE job_id = %(job_id)s;
 
 -- name: stuck_on
