@@ -77,7 +77,7 @@ def test_each_term_is_the_evaluator_s(name, made, serve, viewer, capture, record
     white = colour.white_point(shade(package, buffer))
     reference = Reference(package, camera, buffer, steady(package.scene, camera, buffer), white)
     left_out = 1.0 - reference.inner.mean()
-    record_property("left_out", left_out)
+    record_property("left_out", float(left_out))
     assert left_out < MOST_LEFT_OUT
     lit = [*WHOLE, Term.UNOCCLUDED] if package.environment else [Term.EMISSION, Term.DIFFUSE, Term.INTERREFLECTION]
     told = []
@@ -88,7 +88,7 @@ def test_each_term_is_the_evaluator_s(name, made, serve, viewer, capture, record
             if name != "courtyard" or terms != [Term.EMISSION]:  # nothing glows there
                 assert expected[reference.inner].max() > 0.05 * white, terms
             psnr = reference.psnr(capture(page, camera, terms, WIDTH, HEIGHT, FINER), terms)
-            record_property("+".join(terms), psnr)
+            record_property("+".join(terms), float(psnr))
             told.append((name, "+".join(terms), round(psnr, 1)))
             assert psnr >= LEAST_PSNR, told
         # The measure tells pictures apart that differ little: one pixel to the side, one term for another.
