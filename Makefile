@@ -41,7 +41,7 @@ chromium:
 	@deploy/install/chromium.sh
 
 test: lint node chromium
-	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
+	$(BIN)/pytest
 
 hostile: venv
 	LIGHTKILN_HOSTILE_EXAMPLES=400 $(BIN)/pytest tests/hostile/test_openapi.py -q -rP
