@@ -76,8 +76,7 @@ async def curves(database: Database, job_id: str) -> tuple[CurveView, ...]:
 
 async def task_log(database: Database, task_id: str, tail: int | None = None) -> str:
     """All that the attempts of a task wrote, each under a line that names it; or the last `tail` lines of that."""
-    text = "".join([piece async for piece in _log_pieces(database, task_id, LogPlace())])
-    return text if tail is None else "".join(text.splitlines(keepends=True)[-tail:])
+    return await _log_so_far(database, task_id, LogPlace(), tail)
 
 
 async def follow_log(
@@ -85,8 +84,7 @@ async def follow_log(
 ) -> AsyncIterator[str]:
     """The same, and what is written from now on until the task is over."""
     place, over = LogPlace(), False
-    text = "".join([piece async for piece in _log_pieces(database, task_id, place)])
-    yield text if tail is None else "".join(text.splitlines(keepends=True)[-tail:])
+    yield await _log_so_far(database, task_id, place, tail)
     with signals.watch(EVENT_CHANNEL) as woken:
         while not over and not signals.stopping:
             woken.clear()
@@ -105,6 +103,12 @@ class LogPlace:
 
     row: int = 0
     attempt: int | None = None
+
+
+async def _log_so_far(database: Database, task_id: str, place: LogPlace, tail: int | None) -> str:
+    """What there is after `place`, or the last `tail` lines of it."""
+    text = "".join([piece async for piece in _log_pieces(database, task_id, place)])
+    return text if tail is None else "".join(text.splitlines(keepends=True)[-tail:])
 
 
 async def _log_pieces(database: Database, task_id: str, place: LogPlace) -> AsyncIterator[str]:

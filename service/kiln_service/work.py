@@ -121,8 +121,7 @@ class Work:
         picked = await queue.pick(tx, worker, kinds, stale_s, job.id)
         if picked is None:
             return _GONE
-        task = TaskRow.of(await tx.one("lock_task", id=picked.task_id))
-        task = await transitions.claim_task(tx, job, task, worker)
+        task = await transitions.claim_task(tx, job, await _lock(tx, picked.task_id), worker)
         payload = await build_payload(tx, job, task)
         return Claim(task_id=task.id, job_id=job.id, attempt=task.attempt, payload=payload, checkpoint=task.checkpoint)
 
