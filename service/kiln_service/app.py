@@ -50,7 +50,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
         docs_url=None,
         redoc_url=None,
     )
-    for module in (job_routes, blob_routes, worker_routes, operator_routes, health_routes):
+    for module in (worker_routes, job_routes, blob_routes, operator_routes, health_routes):
         app.include_router(module.router)
 
     document = functools.cache(lambda: openapi_document(app))

@@ -145,7 +145,7 @@ class Blobs:
         """The row first: cut off in between, an object is left that nothing vouches for, and never the reverse."""
         async with self._database.transaction() as tx:
             await tx.run("lock_blob", sha256=sha256)
-            deleted = await tx.run("delete_unused_blob", sha256=sha256, seconds=grace_s)
+            deleted = await tx.count("delete_unused_blob", sha256=sha256, seconds=grace_s)
         if deleted:
             async with self._database.transaction() as tx:
                 await tx.run("lock_blob", sha256=sha256)
@@ -248,9 +248,9 @@ async def use_blobs(tx: Tx, owner: str, hashes: Iterable[str]) -> None:
     await tx.run("add_blob_uses", owner=owner, hashes=sorted(set(hashes)))
 
 
-async def drop_blobs(tx: Tx, owner: str) -> None:
-    """`owner` no longer uses any blob."""
-    await tx.run("drop_blob_uses", owner=owner)
+async def drop_blobs(tx: Tx, *owners: str) -> None:
+    """`owners` no longer use any blob."""
+    await tx.run("drop_blob_uses", owners=list(owners))
 
 
 async def _nothing() -> AsyncIterator[bytes]:

@@ -15,7 +15,7 @@ from psycopg_pool import PoolTimeout
 
 from kiln_service.blobs import Blobs
 from kiln_service.config import ServiceConfig
-from kiln_service.db import Database, Tx
+from kiln_service.db import Database, execute
 from kiln_service.reaper import reap
 from kiln_service.retention import apply_rules
 from kiln_service.work import Work
@@ -46,13 +46,17 @@ class Maintenance:
 
     async def _lead(self, connection: psycopg.AsyncConnection[DictRow]) -> None:
         """Wait for leadership, then work as long as the connection that holds it lives."""
-        while not (await Tx(connection).one("try_leadership", lock=LEADER_LOCK))["leader"]:
+        while not await self._leads(connection):
             await asyncio.sleep(self._timing.maintenance_s)
         grace_over = time.monotonic() + self._timing.stale_s
         while True:
             await self._pass(may_reap=time.monotonic() >= grace_over)
             await asyncio.sleep(self._timing.maintenance_s)
-            await Tx(connection).one("ping")
+            await execute(connection, "ping")
+
+    async def _leads(self, connection: psycopg.AsyncConnection[DictRow]) -> bool:
+        row = await (await execute(connection, "try_leadership", lock=LEADER_LOCK)).fetchone()
+        return row is not None and bool(row["leader"])
 
     async def _pass(self, *, may_reap: bool) -> None:
         """One round of everything; a defect in one part is logged and does not end the others."""

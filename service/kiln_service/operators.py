@@ -2,7 +2,7 @@
 
 import hashlib
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from psycopg.rows import DictRow
@@ -23,7 +23,6 @@ from kiln_schemas.operators import (
 )
 from kiln_service.config import OWN_TOKEN, ServiceConfig
 from kiln_service.db import Database, Tx, picked
-from kiln_service.schedules import read_schedule, sleeps_at
 
 OFFLINE_S: Final = 60.0
 ERROR_AFTER: Final = 3
@@ -114,7 +113,7 @@ async def set_schedule(database: Database, worker: str, schedule: SleepSchedule,
 async def drop_schedule(database: Database, worker: str, actor: str) -> None:
     """They sleep when they are told to and at no other time. Asking twice is no error."""
     async with database.transaction() as tx:
-        if await tx.run("delete_schedule", worker=worker):
+        if await tx.count("delete_schedule", worker=worker):
             await record(tx, actor, "worker.schedule", worker)
 
 
@@ -131,16 +130,24 @@ async def record(tx: Tx, actor: str, action: str, target: str, detail: Mapping[s
 
 def _worker_view(row: DictRow) -> WorkerView:
     task = None if row["task_id"] is None else f"{row['kind']} {row['label']}"
-    schedule = None if row["days"] is None else read_schedule(row)
-    made = {"state": _state(row, schedule), "task": task, "schedule": schedule}
+    made = {"state": _state(row), "task": task, "schedule": _schedule(row)}
     return WorkerView.model_validate({name: row[name] for name in WorkerView.model_fields if name not in made} | made)
 
 
-def _state(row: DictRow, schedule: SleepSchedule | None) -> WorkerState:
+def _schedule(row: DictRow) -> SleepSchedule | None:
+    if row["days"] is None:
+        return None
+    days: Sequence[int] = row["days"]
+    return SleepSchedule(
+        days=tuple(DAYS[day] for day in days), begins=row["begins"], ends=row["ends"], timezone=row["timezone"]
+    )
+
+
+def _state(row: DictRow) -> WorkerState:
     if row["offline"]:
         return WorkerState.OFFLINE
     if row["orders"] == "drain":
         return WorkerState.DRAINING
-    if row["orders"] == "sleep" or (schedule is not None and sleeps_at(schedule, row["now"])):
+    if row["orders"] == "sleep" or row["asleep"]:
         return WorkerState.ASLEEP
     return WorkerState.ERROR if row["strikes"] >= ERROR_AFTER else WorkerState.AWAKE

@@ -6,23 +6,14 @@ on blocks, and on who else is there (`work.sql`, pick_task).
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from typing import Final
 
 from kiln_schemas.tasks import TaskKind
-from kiln_service.db import Tx, WorkerRow
+from kiln_service.db import TaskRow, Tx, WorkerRow
 from kiln_service.planner import PRIORITY
 
 RANK_STEP: Final = 8
 """A job's priority counts before its tasks' kinds, of which there are fewer."""
-
-
-@dataclass(frozen=True)
-class Picked:
-    """A task that a worker may claim, at the moment of looking."""
-
-    task_id: str
-    job_id: str
 
 
 def rank(priority: int, kind: TaskKind) -> int:
@@ -32,7 +23,7 @@ def rank(priority: int, kind: TaskKind) -> int:
 
 async def pick(
     tx: Tx, worker: WorkerRow, kinds: Collection[TaskKind], stale_s: float, job_id: str | None = None
-) -> Picked | None:
+) -> TaskRow | None:
     """The task that this worker gets next, of all jobs or of one; nothing is locked.
 
     Workers not seen for `stale_s` count as gone.
@@ -45,7 +36,7 @@ async def pick(
         job_id=job_id,
         stale_s=stale_s,
     )
-    return None if row is None else Picked(row["id"], row["job_id"])
+    return None if row is None else TaskRow.of(row)
 
 
 async def announce(tx: Tx, kinds: Collection[TaskKind]) -> None:

@@ -12,7 +12,7 @@ from kiln_schemas.errors import BakeFailed, Problem
 from kiln_schemas.states import TaskState
 from kiln_service import transitions
 from kiln_service.db import Database, TaskRow, Tx
-from kiln_service.work import Work, lock_task
+from kiln_service.work import Work, locked_task
 
 log = logging.getLogger(__name__)
 
@@ -28,8 +28,7 @@ async def reap(database: Database, work: Work, stale_s: float) -> int:
 
 
 async def _reap_one(database: Database, work: Work, task_id: str, stale_s: float) -> int:
-    async with database.transaction() as tx:
-        job, task = await lock_task(tx, task_id)
+    async with locked_task(database, task_id) as (tx, job, task):
         still = await tx.one("task_is_stale", id=task_id, seconds=stale_s)
         if task.state is not TaskState.ACTIVE or not still["stale"]:
             return 0

@@ -125,7 +125,10 @@ async def release_tasks(tx: Tx, job: JobRow, kind: TaskKind) -> None:
 async def claim_task(tx: Tx, job: JobRow, task: TaskRow, worker: WorkerRow) -> TaskRow:
     """queued, soft-failed > active under a new attempt; the job's first claim moves it to active too."""
     check_task_move(task.state, TaskState.ACTIVE)
-    claimed = TaskRow.of(await tx.one("move_task_active", id=task.id, before=task.state, worker_id=worker.id))
+    await _move(tx, "move_task_active", task, worker_id=worker.id)
+    claimed = replace(
+        task, state=TaskState.ACTIVE, attempt=task.attempt + 1, worker_id=worker.id, progress=None, started=None
+    )
     if job.state is JobState.QUEUED:
         await move_job(tx, job, JobState.ACTIVE, COORDINATOR)
     await _task_event(tx, claimed, "task.claimed", f"worker:{worker.id}", {"worker": worker.name})
@@ -173,9 +176,7 @@ async def cancel_idle_tasks(tx: Tx, job: JobRow, actor: str) -> None:
     for state in before:
         check_task_move(state, TaskState.CANCELED)
     rows = await tx.all("cancel_idle_tasks", job_id=job.id, before=[state.value for state in before])
-    for row in rows:
-        if row["checkpoint"] is not None:
-            await drop_blobs(tx, f"checkpoint:{row['id']}")
+    await drop_blobs(tx, *(f"checkpoint:{row['id']}" for row in rows if row["checkpoint"] is not None))
     if rows:
         await add_event(tx, job.id, "tasks.canceled", actor, detail={"count": len(rows)})
 
@@ -221,9 +222,7 @@ async def redo_tasks(tx: Tx, job: JobRow, ids: Sequence[str], after: TaskState) 
     rows = await tx.all("redo_tasks", job_id=job.id, ids=list(ids), before=states, after=after)
     moved = [row["id"] for row in rows]
     await tx.run("forget_task_failures", ids=moved)
-    for task_id in moved:
-        await drop_blobs(tx, f"checkpoint:{task_id}")
-        await drop_blobs(tx, f"result:{task_id}")
+    await drop_blobs(tx, *(f"{use}:{task_id}" for use in ("checkpoint", "result") for task_id in moved))
     return len(moved)
 
 
@@ -250,16 +249,15 @@ async def move_job(
 ) -> JobRow:
     """Move a job and tell it."""
     check_job_move(job.state, after)
-    moved = await tx.run(
+    await tx.move(
         "move_job",
+        IllegalTransition(f"job {job.id} is no longer {job.state}"),
         id=job.id,
         before=job.state,
         after=after.value,
         final=after in FINAL_JOB_STATES,
         error=Jsonb(error.model_dump(mode="json")) if error else None,
     )
-    if moved != 1:
-        raise IllegalTransition(f"job {job.id} is no longer {job.state}")
     told = (detail or {}) | ({"problem": error.model_dump(mode="json")} if error else {})
     await add_event(tx, job.id, f"job.{after.value}", actor, detail=told)
     return replace(job, state=after, error=error or job.error)
@@ -285,8 +283,8 @@ async def _need_no_checkpoint(tx: Tx, task: TaskRow) -> None:
 
 
 async def _move(tx: Tx, query: str, task: TaskRow, **parameters: Any) -> None:
-    if await tx.run(query, id=task.id, before=task.state, **parameters) != 1:
-        raise IllegalTransition(f"task {task.id} is no longer {task.state}")
+    moved_by_others = IllegalTransition(f"task {task.id} is no longer {task.state}")
+    await tx.move(query, moved_by_others, id=task.id, before=task.state, **parameters)
 
 
 async def _task_event(tx: Tx, task: TaskRow, kind: str, actor: str, detail: dict[str, Any] | None = None) -> None:

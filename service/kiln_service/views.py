@@ -108,7 +108,8 @@ class LogPlace:
 async def _log_so_far(database: Database, task_id: str, place: LogPlace, tail: int | None) -> str:
     """What there is after `place`, or the last `tail` lines of it."""
     text = "".join([piece async for piece in _log_pieces(database, task_id, place)])
-    return text if tail is None else "".join(text.splitlines(keepends=True)[-tail:])
+    lines = text.splitlines(keepends=True)
+    return text if tail is None else "".join(lines[max(0, len(lines) - tail) :])
 
 
 async def _log_pieces(database: Database, task_id: str, place: LogPlace) -> AsyncIterator[str]:

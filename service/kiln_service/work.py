@@ -7,7 +7,8 @@ transaction under the job's lock, so the last tile's fan-in happens once.
 """
 
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from typing import Final
 
@@ -40,11 +41,10 @@ from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, JobRow, TaskRow, Tx, WorkerRow
 from kiln_service.events import QUEUED_CHANNEL, Signals, add_event, wait
 from kiln_service.ids import new_id
-from kiln_service.jobs import lock_job, settle_cancel
+from kiln_service.jobs import settle_cancel
 from kiln_service.payloads import build_payload
 from kiln_service.planner import METHODS, plan_after_prepare
 from kiln_service.reuse import renders_to_reuse
-from kiln_service.schedules import is_asleep
 
 RELEASED_CODE: Final = "canceled"
 """A worker that leaves in good order gives its task back with this code; that is no strike against the task."""
@@ -101,44 +101,41 @@ class Work:
                     await wait(woken, min(left, self._signals.claim_poll_s(self._config.timing.poll_s)))
 
     async def _claim_once(self, worker_id: str, kinds: Sequence[TaskKind]) -> "Claim | _Outcome":
+        stale_s = self._config.timing.stale_s
         async with self._database.transaction() as tx:
             worker = await _find_worker(tx, worker_id)
-            found = await self._take(tx, worker, kinds)
-            await tx.run("see_worker" if isinstance(found, Claim) else "see_worker_lightly", id=worker_id)
-        return found
-
-    async def _take(self, tx: Tx, worker: WorkerRow, kinds: Sequence[TaskKind]) -> "Claim | _Outcome":
-        if worker.orders == "drain":
-            raise Drained("an operator told the worker to leave", where=worker.name)
-        if worker.orders == "sleep" or await is_asleep(tx, worker.name):
-            return _NOTHING
-        stale_s = self._config.timing.stale_s
-        seen = await queue.pick(tx, worker, kinds, stale_s)
-        if seen is None:
-            return _NOTHING
-        job = await lock_job(tx, seen.job_id)
-        # Others that held the lock may have claimed it: look again, now that nobody else can.
-        picked = await queue.pick(tx, worker, kinds, stale_s, job.id)
-        if picked is None:
-            return _GONE
-        task = await transitions.claim_task(tx, job, await _lock(tx, picked.task_id), worker)
-        payload = await build_payload(tx, job, task)
+            if worker.orders == "drain":
+                raise Drained("an operator told the worker to leave", where=worker.name)
+            rests = worker.orders == "sleep" or worker.asleep
+            seen = None if rests else await queue.pick(tx, worker, kinds, stale_s)
+            if seen is None:
+                await tx.run("see_worker_lightly", id=worker_id)
+                return _NOTHING
+        async with self._database.turn(seen.job_id) as tx:
+            locked = await tx.ask("lock_job", id=seen.job_id)
+            # Others may have claimed it meanwhile: look again, now that nobody else can.
+            task = await queue.pick(tx, worker, kinds, stale_s, seen.job_id)
+            row = await locked.fetchone()
+            if task is None or row is None:
+                return _GONE
+            job = JobRow.of(row)
+            task = await transitions.claim_task(tx, job, task, worker)
+            payload = await build_payload(tx, job, task)
+            await tx.run("see_worker", id=worker_id)
         return Claim(task_id=task.id, job_id=job.id, attempt=task.attempt, payload=payload, checkpoint=task.checkpoint)
 
     async def heartbeat(self, worker_id: str, beat: Heartbeat) -> HeartbeatReply:
         """Keep the attempt alive, or tell the worker to stop."""
         async with self._database.transaction() as tx:
-            await _find_worker(tx, worker_id)
+            about, progress = {"task_id": beat.task_id, "attempt": beat.attempt}, beat.progress
             await _add_log(tx, beat.task_id, beat.attempt, beat.log)
-            row = await tx.maybe(
-                "beat_task",
-                id=beat.task_id,
-                attempt=beat.attempt,
-                progress=Jsonb(beat.progress.model_dump(mode="json")) if beat.progress else None,
-            )
-            if row is not None and beat.progress is not None and beat.progress.loss is not None:
-                await tx.run("add_loss", task_id=beat.task_id, step=beat.progress.done, loss=beat.progress.loss)
+            told = Jsonb(progress.model_dump(mode="json")) if progress else None
+            beaten = await tx.ask("beat_task", **about, progress=told)
+            if progress is not None and progress.loss is not None:
+                await tx.run("add_loss", **about, step=progress.done, loss=progress.loss)
             await tx.run("see_worker_lightly", id=worker_id)
+            await _find_worker(tx, worker_id)
+            row = await beaten.fetchone()
         if row is None:
             return HeartbeatReply(stop=True, reason="the task was given to another attempt or is over")
         state = JobState(row["job_state"])
@@ -149,16 +146,14 @@ class Work:
 
     async def _stop_attempt(self, task_id: str, attempt: int, reason: str) -> None:
         """The worker is being told to stop: the task is canceled, and any later word of the attempt refused."""
-        async with self._database.transaction() as tx:
-            job, task = await lock_task(tx, task_id)
+        async with locked_task(self._database, task_id) as (tx, job, task):
             if task.state is TaskState.ACTIVE and task.attempt == attempt:
                 await transitions.cancel_task(tx, task, transitions.COORDINATOR, reason)
                 await settle_cancel(tx, job)
 
     async def checkpoint(self, task_id: str, checkpoint: Checkpoint) -> None:
         """Publish a checkpoint for later attempts; the one before is no longer used."""
-        async with self._database.transaction() as tx:
-            _, task = await lock_task(tx, task_id)
+        async with locked_task(self._database, task_id) as (tx, _, task):
             _check_fence(task, checkpoint.attempt)
             await _require(tx, [checkpoint.sha256])
             await drop_blobs(tx, f"checkpoint:{task.id}")
@@ -169,8 +164,7 @@ class Work:
     async def commit(self, task_id: str, commit: Commit) -> None:
         """Take an attempt's result. The same commit again (its answer was lost) is no error."""
         stopped: StaleAttempt | None = None
-        async with self._database.transaction() as tx:
-            job, task = await lock_task(tx, task_id)
+        async with locked_task(self._database, task_id) as (tx, job, task):
             if _is_repeated(task, commit):
                 return
             _check_fence(task, commit.attempt)
@@ -186,9 +180,9 @@ class Work:
 
     async def _accept(self, tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
         """Complete the task, publish what it made, and go on with the job."""
-        made = _blobs_of(result)
-        await _require(tx, made)
-        await use_blobs(tx, f"result:{task.id}", made)
+        if made := _blobs_of(result):
+            await _require(tx, made)
+            await use_blobs(tx, f"result:{task.id}", made)
         await transitions.complete_task(tx, task, result)
         if isinstance(result, PrepareResult):
             await tx.run("add_notes", id=job.id, notes=Jsonb(list(result.notes)))
@@ -213,8 +207,7 @@ class Work:
 
     async def fail(self, task_id: str, failure: Failure) -> None:
         """An attempt ended without a result: another may try, or the task fails."""
-        async with self._database.transaction() as tx:
-            job, task = await lock_task(tx, task_id)
+        async with locked_task(self._database, task_id) as (tx, job, task):
             _check_fence(task, failure.attempt)
             await _add_log(tx, task.id, failure.attempt, failure.log)
             await self.end_attempt(
@@ -272,13 +265,18 @@ _GONE: Final = _Outcome()
 """Somebody else was quicker; look again at once."""
 
 
-async def lock_task(tx: Tx, task_id: str) -> tuple[JobRow, TaskRow]:
-    """A task and its job, both locked, the job first."""
-    owner = await tx.maybe("job_of_task", id=task_id)
+@asynccontextmanager
+async def locked_task(database: Database, task_id: str) -> AsyncIterator[tuple[Tx, JobRow, TaskRow]]:
+    """A transaction with a task and its job, both locked, the job first."""
+    owner = await database.first("job_of_task", id=task_id)
     if owner is None:
         raise NotFound(f"no task '{task_id}'", where="task")
-    job = await lock_job(tx, owner["job_id"])
-    return job, await _lock(tx, task_id)
+    async with database.turn(owner["job_id"]) as tx:
+        locked = await tx.ask("lock_job", id=owner["job_id"])
+        task = await _lock(tx, task_id)
+        job = await locked.fetchone()
+        assert job is not None, "jobs with tasks are never deleted"
+        yield tx, JobRow.of(job), task
 
 
 async def _lock(tx: Tx, task_id: str) -> TaskRow:
@@ -297,23 +295,19 @@ async def _fan_in(tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
 
     Where only failed tasks are left of the stage, the job fails with the first of them.
     """
-    if await _unfinished(tx, job, task.kind):
-        if stuck := await tx.maybe("stuck_on", job_id=job.id):
-            await transitions.fail_job(tx, job, Problem.model_validate(stuck["error"]), transitions.COORDINATOR)
+    left = await tx.one("stage_left", job_id=job.id, kind=task.kind)
+    if left["unfinished"]:
+        if left["stuck"]:
+            await transitions.fail_job(tx, job, Problem.model_validate(left["stuck"]), transitions.COORDINATOR)
         return
     stage = METHODS[job.method].stage_after(task.kind)
-    while stage is not None and not await _unfinished(tx, job, stage):
+    while stage is not None and not (await tx.one("stage_left", job_id=job.id, kind=stage))["unfinished"]:
         stage = METHODS[job.method].stage_after(stage)
     if stage is None:
         await transitions.finish_job(tx, job, result.gates if isinstance(result, PackageResult) else ())
         return
     await add_event(tx, job.id, "stage.completed", transitions.COORDINATOR, detail={"kind": task.kind.value})
     await transitions.release_tasks(tx, job, stage)
-
-
-async def _unfinished(tx: Tx, job: JobRow, kind: TaskKind) -> bool:
-    """Whether tasks of a kind have not completed; False also where the job has no such task."""
-    return bool((await tx.one("has_unfinished", job_id=job.id, kind=kind))["unfinished"])
 
 
 def _check_fence(task: TaskRow, attempt: int) -> None:

@@ -238,6 +238,7 @@ def test_a_log_is_followed_to_its_end(home):
     worker.beat(claim, log="one\ntwo\n")
     url = f"/v1/tasks/{claim['task_id']}/log"
     assert home.client.get(url, params={"tail": 1}).text == "two\n"
+    assert home.client.get(url, params={"tail": 0}).text == ""
     pieces = []
     with home.client.stream("GET", url, params={"follow": True, "tail": 2}) as stream:
         for piece in stream.iter_text():

@@ -9,7 +9,6 @@ from pydantic import ValidationError
 
 from kiln_schemas.operators import DAYS, SleepSchedule
 from kiln_service.events import CLAIMS_WOKEN
-from kiln_service.schedules import sleeps_at
 
 
 def listed(home, name):
@@ -59,6 +58,25 @@ def test_a_worker_alone_tries_again_itself(home):
     one.fail(one.must_claim()).raise_for_status()
     assert other.claim("fit") is None
     assert one.must_claim()["attempt"] == 2
+
+
+def test_a_worker_that_sleeps_is_nobody_to_wait_for(home):
+    """By its schedule as by order: a task that it alone has not failed goes on elsewhere."""
+    home.submit()
+    one, other = home.worker("one"), home.worker("other")
+    one.fail(one.must_claim()).raise_for_status()
+    assert one.claim() is None
+    always = {"days": list(DAYS), "begins": "00:00", "ends": "00:00"}
+    home.client.put("/v1/schedules/other", json=always).raise_for_status()
+    assert other.claim() is None and one.must_claim()["attempt"] == 2
+
+
+def test_a_worker_without_the_tags_is_nobody_to_leave_the_rest_to(home):
+    """The job fails with its first task that fails for good, where nobody else may do the others."""
+    job, one, _ = home.submit(tags=["gpu"]), home.worker("one", tags=["gpu"]), home.worker("other")
+    one.finish(one.must_claim(), tiles=4)
+    one.fail(one.must_claim("render"), retryable=False).raise_for_status()
+    assert home.client.get(f"/v1/jobs/{job['id']}").json()["state"] == "failed"
 
 
 def test_a_worker_that_fails_two_tiles_is_blocked_and_forgiven(start):
@@ -160,7 +178,14 @@ def test_a_schedule_that_is_none_is_refused(home, change, word):
     assert reply.status_code == 422 and word in reply.text
 
 
-def test_the_span_of_a_schedule():
+def sleeps_at(home, schedule, *instants):
+    """Whether a worker with this schedule sleeps at each of these instants."""
+    home.client.put("/v1/schedules/w", json=schedule.model_dump(mode="json")).raise_for_status()
+    asked = "SELECT asleep_at('w', at) AS asleep FROM unnest(%s::timestamptz[]) WITH ORDINALITY AS t (at, n) ORDER BY n"
+    return [row["asleep"] for row in home.sql(asked, list(instants))]
+
+
+def test_the_span_of_a_schedule(home):
     """Every half hour of a week against the obvious reference: the union of spans laid out on a line."""
     for begins, ends in ((time(8), time(18)), (time(22), time(6)), (time(0), time(0))):
         schedule = SleepSchedule(days=("mon", "sun"), begins=begins, ends=ends)
@@ -172,16 +197,18 @@ def test_the_span_of_a_schedule():
                 start = midnight + timedelta(hours=begins.hour)
                 length = (ends.hour - begins.hour) % 24 or 24
                 spans.append((start, start + timedelta(hours=length)))
-        for half_hour in range(2 * 24 * 7):
-            now = monday + timedelta(minutes=30 * half_hour)
-            assert sleeps_at(schedule, now) == any(start <= now < stop for start, stop in spans), (begins, now)
+        week = [monday + timedelta(minutes=30 * half_hour) for half_hour in range(2 * 24 * 7)]
+        expected = [any(start <= now < stop for start, stop in spans) for now in week]
+        assert sleeps_at(home, schedule, *week) == expected, begins
 
 
-def test_a_schedule_follows_the_local_clock():
+def test_a_schedule_follows_the_local_clock(home):
     schedule = SleepSchedule(days=("wed",), begins=time(8), ends=time(9), timezone="America/New_York")
-    assert sleeps_at(schedule, datetime(2026, 7, 1, 12, 30, tzinfo=UTC)), "summer time, four hours behind"
-    assert not sleeps_at(schedule, datetime(2026, 12, 2, 12, 30, tzinfo=UTC))
-    assert sleeps_at(schedule, datetime(2026, 12, 2, 13, 30, tzinfo=UTC))
+    summer, *winter = (datetime(2026, *when, tzinfo=UTC) for when in ((7, 1, 12, 30), (12, 2, 12, 30), (12, 2, 13, 30)))
+    assert sleeps_at(home, schedule, summer, *winter) == [True, False, True], "in summer four hours behind"
+
+
+def test_a_schedule_that_names_no_zone_is_refused():
     with pytest.raises(ValidationError):
         SleepSchedule(days=("wed",), begins=time(8), ends=time(9), timezone="")
 

@@ -173,27 +173,29 @@ def test_one_of_two_is_killed_and_the_other_goes_on(replicas, leaders, result, e
     assert len(labels) == len(set(labels)) > 16, "no task is completed twice"
 
 
-def test_sigterm_ends_polls_and_lets_requests_finish(replicas, leaders, eventually):
+def test_sigterm_ends_polls_and_lets_requests_finish(replicas, leaders, eventually, tmp_path):
+    """Requests that it has begun to answer: one whose bytes it has not yet read may find its connection closed."""
     one, two = replicas
     eventually(leaders)
     registration = {"name": "w", "kinds": ["package"], "memory_bytes": 1, "threads": 1, "device": ""}
     registration["version"] = __version__
     worker = one.client.post("/v1/workers", json=registration).json()["worker_id"]
-    half, sent = threading.Event(), threading.Event()
+    [registered] = [view["seen"] for view in two.client.get("/v1/workers").json()]
+    sent = threading.Event()
     data = b"x" * 1000
     sha256 = hashlib.sha256(data).hexdigest()
 
     def pieces():
         yield data[:500]
-        half.set()
-        sent.wait(20)
+        sent.wait(60)
         yield data[500:]
 
     with ThreadPoolExecutor() as threads:
         body = {"kinds": ["package"], "wait_s": 25}
         poll = threads.submit(one.client.post, f"/v1/workers/{worker}/claim", json=body)
         upload = threads.submit(one.client.put, f"/v1/blobs/{sha256}", content=pieces())
-        assert half.wait(20)
+        eventually(lambda: two.client.get("/v1/workers").json()[0]["seen"] != registered)
+        eventually(lambda: any((tmp_path / "one" / "incoming").iterdir()))
         one.process.send_signal(signal.SIGTERM)
         assert poll.result(20).status_code == 204, "the poll ends at once, in order"
 

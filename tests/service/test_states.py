@@ -14,12 +14,11 @@ from kiln_service import transitions
 from kiln_service.db import Database, TaskRow, WorkerRow
 from kiln_service.db.queries import all_queries, parse_queries
 from kiln_service.jobs import lock_job
-from kiln_service.work import lock_task
 
 
 def moves(row, job):
     """Every move of a task by name, as a function of a transaction."""
-    worker = WorkerRow(id=row.worker_id or "", name="w", kinds=(), tags=(), orders="work")
+    worker = WorkerRow(id=row.worker_id or "", name="w", kinds=(), tags=(), orders="work", asleep=False)
     problem = transitions.IllegalTransition("x").problem()
     return {
         "claim": lambda tx: transitions.claim_task(tx, job, row, worker),
@@ -44,6 +43,12 @@ class Undo(Exception):
     """Rolls a transaction back."""
 
 
+async def locked(tx, task_id):
+    """A task's job and the task."""
+    row = TaskRow.of(await tx.one("lock_task", id=task_id))
+    return await lock_job(tx, row.job_id), row
+
+
 async def try_move(dsn, task_id, state, name):
     """Whether a task that is in a state takes a move; nothing stays changed."""
     async with Database(dsn) as database:
@@ -51,8 +56,9 @@ async def try_move(dsn, task_id, state, name):
             async with database.transaction() as tx:
                 done = "'{}'" if state is TaskState.COMPLETED else "NULL"
                 await tx.connection.execute(f"UPDATE tasks SET state = '{state}', result = {done}".encode())
-                job, row = await lock_task(tx, task_id)
+                job, row = await locked(tx, task_id)
                 await moves(row, job)[name](tx)
+                await tx.check_moves()
                 raise Undo
         except Undo:
             return True
@@ -86,6 +92,7 @@ def test_a_job_makes_exactly_the_moves_of_the_table(home):
                 async with database.transaction() as tx:
                     await tx.connection.execute(f"UPDATE jobs SET state = '{before}'".encode())
                     await transitions.move_job(tx, await lock_job(tx, job_id), after, "test")
+                    await tx.check_moves()
                     raise Undo
             except Undo:
                 return True
@@ -104,7 +111,7 @@ def test_a_move_from_a_state_that_is_no_longer_true_raises(home):
 
     async def move_twice():
         async with Database(home.config.database) as database, database.transaction() as tx:
-            _, row = await lock_task(tx, claim["task_id"])
+            _, row = await locked(tx, claim["task_id"])
             stale = replace(row, state=TaskState.ACTIVE)
             await transitions.cancel_task(tx, row, "test", "")
             await transitions.cancel_task(tx, stale, "test", "")

@@ -30,8 +30,8 @@ SELECT unnest(%(hashes)s::text[]), %(owner)s
 ON CONFLICT DO NOTHING;
 
 -- name: drop_blob_uses
--- An owner needs none any more.
-DELETE FROM blob_uses WHERE owner = %(owner)s;
+-- Some owners need none any more.
+DELETE FROM blob_uses WHERE owner = ANY(%(owners)s);
 
 -- name: unused_blobs
 -- Blobs that nobody uses and that were not asked for within the grace period.

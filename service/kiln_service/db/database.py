@@ -2,40 +2,77 @@
 
 A `Tx` runs named queries inside one transaction. The order in which rows are locked is the same everywhere,
 so transactions do not deadlock: the worker that asks > the job > its tasks.
+
+With a thousand workers, how long a job's lock is held bounds how many of its tasks are claimed. So statements are
+pipelined (psycopg's pipeline mode): what is not read is sent together with what comes after it. And who waits for a
+job (`turn`) waits in this process, where the next one goes on at once and no connection is held meanwhile.
 """
 
+import asyncio
+import time
+import weakref
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import psycopg
+from psycopg import AsyncCursor, AsyncPipeline
 from psycopg.rows import DictRow, dict_row
 from psycopg_pool import AsyncConnectionPool
 
 from kiln_schemas.errors import InternalError
 from kiln_service.db.queries import all_queries
 
+FRESH_S: Final = 1.0
+"""A connection that worked so short a time ago is used again without asking whether it still does."""
+
+
+class Connection(psycopg.AsyncConnection[DictRow]):
+    """A pooled connection, and when it was last asked whether it works."""
+
+    checked: float = 0.0
+
 
 class Tx:
-    """One open transaction; every method runs the named query with the given parameters."""
+    """One open transaction; every method sends the named query with the given parameters."""
 
-    def __init__(self, connection: psycopg.AsyncConnection[DictRow]) -> None:
-        self.connection = connection
+    def __init__(self, connection: psycopg.AsyncConnection[DictRow], pipeline: AsyncPipeline) -> None:
+        self.connection, self._pipeline = connection, pipeline
+        self._moves: list[tuple[AsyncCursor[DictRow], Exception]] = []
 
-    async def run(self, query: str, **parameters: Any) -> int:
+    async def run(self, query: str, **parameters: Any) -> None:
+        """Without waiting; an error is raised by what is waited for next, at the latest by the commit."""
+        await execute(self.connection, query, **parameters)
+
+    async def ask(self, query: str, **parameters: Any) -> AsyncCursor[DictRow]:
+        """Without waiting, to be fetched from later."""
+        return await execute(self.connection, query, **parameters)
+
+    async def move(self, query: str, otherwise: Exception, **parameters: Any) -> None:
+        """Without waiting; `otherwise` is raised before the commit unless one row was touched."""
+        self._moves.append((await self.ask(query, **parameters), otherwise))
+
+    async def check_moves(self) -> None:
+        """Wait for what `move` was told, if it is not there yet."""
+        if any(cursor.pgresult is None for cursor, _ in self._moves):
+            await self._pipeline.sync()
+        for cursor, otherwise in self._moves:
+            if cursor.rowcount != 1:
+                raise otherwise
+
+    async def count(self, query: str, **parameters: Any) -> int:
         """The number of rows touched."""
-        cursor = await self.connection.execute(all_queries()[query], parameters)
+        cursor = await self.ask(query, **parameters)
+        await self._pipeline.sync()
         return cursor.rowcount
 
     async def all(self, query: str, **parameters: Any) -> list[DictRow]:
         """All rows."""
-        cursor = await self.connection.execute(all_queries()[query], parameters)
-        return await cursor.fetchall()
+        return await (await self.ask(query, **parameters)).fetchall()
 
     async def maybe(self, query: str, **parameters: Any) -> DictRow | None:
         """The first row, or None."""
-        cursor = await self.connection.execute(all_queries()[query], parameters)
-        return await cursor.fetchone()
+        return await (await self.ask(query, **parameters)).fetchone()
 
     async def one(self, query: str, **parameters: Any) -> DictRow:
         """The row that must be there."""
@@ -50,15 +87,16 @@ class Database:
 
     def __init__(self, dsn: str, size: int = 10, patience_s: float = 15.0) -> None:
         self.dsn = dsn
-        self._pool: AsyncConnectionPool[psycopg.AsyncConnection[DictRow]] = AsyncConnectionPool(
+        self._turns: weakref.WeakValueDictionary[str, asyncio.Lock] = weakref.WeakValueDictionary()
+        self._pool: AsyncConnectionPool[Connection] = AsyncConnectionPool(
             dsn,
             min_size=2,
             max_size=size,
             timeout=patience_s,
             open=False,
             kwargs={"row_factory": dict_row},
-            check=AsyncConnectionPool.check_connection,
-            connection_class=psycopg.AsyncConnection[DictRow],
+            check=_check,
+            connection_class=Connection,
         )
 
     async def __aenter__(self) -> Self:
@@ -71,9 +109,42 @@ class Database:
     @asynccontextmanager
     async def transaction(self) -> AsyncIterator[Tx]:
         """Commit at the end of the block, roll back when it raises."""
+        async with self._pool.connection() as connection, connection.pipeline() as pipeline:
+            tx = Tx(connection, pipeline)
+            yield tx
+            await tx.check_moves()
+            await connection.commit()  # together with what was not waited for
+
+    @asynccontextmanager
+    async def turn(self, job_id: str) -> AsyncIterator[Tx]:
+        """A transaction that begins by locking this job; in one coordinator they come one after the other, in order."""
+        async with self._turns.setdefault(job_id, asyncio.Lock()), self.transaction() as tx:
+            yield tx
+
+    async def first(self, query: str, **parameters: Any) -> DictRow | None:
+        """The first row of one query that is a transaction of its own, or None."""
         async with self._pool.connection() as connection:
-            yield Tx(connection)
+            await connection.set_autocommit(True)
+            try:
+                return await (await execute(connection, query, **parameters)).fetchone()
+            finally:
+                await connection.set_autocommit(False)
 
     async def dedicated(self) -> psycopg.AsyncConnection[DictRow]:
         """A connection outside the pool, in autocommit, for LISTEN and session locks; the caller closes it."""
         return await psycopg.AsyncConnection.connect(self.dsn, autocommit=True, row_factory=dict_row)
+
+
+async def execute(
+    connection: psycopg.AsyncConnection[DictRow], query: str, **parameters: Any
+) -> psycopg.AsyncCursor[DictRow]:
+    """One named query on a connection of one's own."""
+    return await connection.execute(all_queries()[query], parameters)
+
+
+async def _check(connection: Connection) -> None:
+    """Raise where a connection no longer works; the pool then opens another."""
+    now = time.monotonic()
+    if now - connection.checked > FRESH_S:
+        await AsyncConnectionPool.check_connection(connection)
+        connection.checked = now

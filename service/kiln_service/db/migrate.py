@@ -9,7 +9,7 @@ from importlib import resources
 from typing import Final
 
 from kiln_schemas.errors import Conflict
-from kiln_service.db.database import Database
+from kiln_service.db.database import Database, execute
 
 MIGRATION_LOCK: Final = 0x6B696C6E_0001
 """Advisory lock number: "kiln", 1."""
@@ -24,10 +24,11 @@ def migrations() -> list[tuple[int, str, str]]:
 
 async def migrate(database: Database) -> list[str]:
     """Apply what is missing; the names of the migrations applied."""
-    async with database.transaction() as tx:
-        await tx.run("lock_migrations", lock=MIGRATION_LOCK)
-        await tx.run("make_migrations_table")
-        done = {row["version"]: row for row in await tx.all("list_migrations")}
+    # Not a `Tx`: a file of several statements cannot be pipelined.
+    async with await database.dedicated() as connection, connection.transaction():
+        await execute(connection, "lock_migrations", lock=MIGRATION_LOCK)
+        await execute(connection, "make_migrations_table")
+        done = {row["version"]: row async for row in await execute(connection, "list_migrations")}
         known = migrations()
         if done and max(done) > known[-1][0]:
             raise Conflict(
@@ -39,8 +40,8 @@ async def migrate(database: Database) -> list[str]:
         for version, name, text in known:
             digest = hashlib.sha256(text.encode()).hexdigest()
             if version not in done:
-                await tx.connection.execute(text.encode())
-                await tx.run("record_migration", version=version, name=name, sha256=digest)
+                await connection.execute(text.encode())
+                await execute(connection, "record_migration", version=version, name=name, sha256=digest)
                 applied.append(name)
             elif done[version]["sha256"] != digest:
                 raise Conflict(

@@ -34,7 +34,8 @@ SELECT * FROM audit WHERE (%(before)s::bigint IS NULL OR id < %(before)s) ORDER 
 
 -- name: list_workers
 -- Workers that were seen of late, with the task that each has.
-SELECT workers.*, workers.seen < now() - make_interval(secs => %(offline_s)s) AS offline, now() AS now,
+SELECT workers.*, workers.seen < now() - make_interval(secs => %(offline_s)s) AS offline,
+       asleep_at(workers.name, now()) AS asleep,
        tasks.id AS task_id, tasks.job_id, tasks.kind, tasks.label,
        schedules.days, schedules.begins, schedules.ends, schedules.timezone,
        COALESCE((
@@ -57,10 +58,6 @@ UPDATE workers SET orders = %(orders)s WHERE id = %(id)s RETURNING id, name;
 -- name: delete_blocks
 -- A worker may take tasks of all jobs again.
 DELETE FROM blocks WHERE worker = %(worker)s;
-
--- name: find_schedule
--- When workers of a name sleep, and what time it is.
-SELECT *, now() AS now FROM schedules WHERE worker = %(worker)s;
 
 -- name: put_schedule
 -- Let workers of a name sleep by a schedule.

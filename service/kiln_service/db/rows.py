@@ -121,6 +121,8 @@ class WorkerRow(_Row):
     tags: tuple[str, ...]
     orders: str
     """`work`, `sleep` or `drain`."""
+    asleep: bool
+    """By its schedule, at the moment of looking."""
 
     @classmethod
     def of(cls, row: DictRow) -> Self:

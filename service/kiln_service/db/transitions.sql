@@ -39,8 +39,7 @@ RETURNING id;
 UPDATE tasks
 SET state = 'active', attempt = attempt + 1, worker_id = %(worker_id)s, progress = NULL,
     started = now(), heartbeat = now()
-WHERE id = %(id)s AND state = %(before)s
-RETURNING *;
+WHERE id = %(id)s AND state = %(before)s;
 
 -- name: move_task_requeued
 -- active > queued, soft-failed: the attempt ended without a result.

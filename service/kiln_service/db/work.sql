@@ -12,11 +12,20 @@ SELECT * FROM tasks WHERE id = %(id)s FOR UPDATE;
 -- Which job to lock before a task.
 SELECT job_id FROM tasks WHERE id = %(id)s;
 
--- name: has_unfinished
--- Whether tasks of a kind have not completed.
+-- name: stage_left
+-- Whether tasks of a kind have not completed; and where nothing of the job can be worked on any more because tasks
+-- failed, the error of the first that did.
 SELECT EXISTS (
     SELECT FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state <> 'completed'
-) AS unfinished;
+) AS unfinished, (
+    SELECT error FROM tasks
+    WHERE job_id = %(job_id)s AND state = 'failed'
+      AND NOT EXISTS (
+          SELECT FROM tasks AS other
+          WHERE other.job_id = %(job_id)s AND other.state IN ('queued', 'soft-failed', 'active')
+      )
+    ORDER BY finished LIMIT 1
+) AS stuck;
 
 -- name: tasks_of_kinds
 -- Tasks of some kinds of a job, in the order of planning.
@@ -30,28 +39,17 @@ SELECT count(*) FILTER (WHERE kind = %(kind)s) AS total,
        count(*) FILTER (WHERE kind = %(kind)s AND state = 'completed') AS completed,
        count(*) FILTER (WHERE state IN ('queued', 'soft-failed', 'active')) AS open,
        EXISTS (
-           SELECT FROM workers AS other, workers AS one
-           WHERE one.id = %(worker_id)s AND other.name <> one.name AND other.orders = 'work'
-             AND other.seen > now() - make_interval(secs => %(stale_s)s) AND %(kind)s = ANY(other.kinds)
+           SELECT FROM takers(%(job_id)s, %(kind)s, %(stale_s)s) AS name
+           WHERE name <> (SELECT workers.name FROM workers WHERE workers.id = %(worker_id)s)
        ) AS others
 FROM tasks WHERE job_id = %(job_id)s;
-
--- name: stuck_on
--- The error of the first failed task of a job of which nothing can be worked on.
-SELECT error FROM tasks
-WHERE job_id = %(job_id)s AND state = 'failed'
-  AND NOT EXISTS (
-      SELECT FROM tasks AS other
-      WHERE other.job_id = %(job_id)s AND other.state IN ('queued', 'soft-failed', 'active')
-  )
-ORDER BY finished LIMIT 1;
 
 -- name: pick_task
 -- The task that a worker gets next, of all jobs or of one: of those that are queued, of its kinds, of jobs that go on
 -- and whose tags it has. Not of a job that it is blocked for, nor one that it has failed while another worker is there
 -- that has not. Job by job: taken together, the planner would sort all their tasks for every claim.
-SELECT best.id, best.job_id FROM jobs CROSS JOIN LATERAL (
-    SELECT tasks.id, tasks.job_id, tasks.rank, tasks.ordinal FROM tasks
+SELECT best.* FROM jobs CROSS JOIN LATERAL (
+    SELECT tasks.* FROM tasks
     WHERE tasks.job_id = jobs.id AND tasks.state IN ('queued', 'soft-failed') AND tasks.kind = ANY(%(kinds)s)
       AND NOT EXISTS (
           SELECT FROM blocks
@@ -61,14 +59,9 @@ SELECT best.id, best.job_id FROM jobs CROSS JOIN LATERAL (
           tasks.state = 'queued'
           OR NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = %(worker)s)
           OR NOT EXISTS (
-              SELECT FROM workers AS other
-              WHERE other.name <> %(worker)s AND other.seen > now() - make_interval(secs => %(stale_s)s)
-                AND other.orders = 'work' AND tasks.kind = ANY(other.kinds) AND jobs.tags <@ other.tags
-                AND NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = other.name)
-                AND NOT EXISTS (
-                    SELECT FROM blocks
-                    WHERE worker = other.name AND blocks.job_id = tasks.job_id AND blocks.kind = tasks.kind AND until > now()
-                )
+              SELECT FROM takers(tasks.job_id, tasks.kind, %(stale_s)s) AS name
+              WHERE name <> %(worker)s
+                AND NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = name)
           )
       )
     ORDER BY tasks.rank DESC, tasks.ordinal
@@ -98,13 +91,7 @@ SELECT (
         WHERE failures.worker = %(worker)s AND tasks.job_id = jobs.id AND tasks.kind = %(kind)s
     ) AS failed
 ) AS tasks, EXISTS (
-    SELECT FROM workers AS other
-    WHERE other.name <> %(worker)s AND other.seen > now() - make_interval(secs => %(stale_s)s)
-      AND other.orders = 'work' AND %(kind)s = ANY(other.kinds) AND jobs.tags <@ other.tags
-      AND NOT EXISTS (
-          SELECT FROM blocks
-          WHERE worker = other.name AND blocks.job_id = jobs.id AND blocks.kind = %(kind)s AND until > now()
-      )
+    SELECT FROM takers(%(job_id)s, %(kind)s, %(stale_s)s) AS name WHERE name <> %(worker)s
 ) AS others
 FROM jobs WHERE jobs.id = %(job_id)s;
 
@@ -186,8 +173,8 @@ INSERT INTO workers (id, name, kinds, memory_bytes, threads, device, version, ta
 VALUES (%(id)s, %(name)s, %(kinds)s, %(memory_bytes)s, %(threads)s, %(device)s, %(version)s, %(tags)s);
 
 -- name: find_worker
--- A registered worker.
-SELECT * FROM workers WHERE id = %(id)s;
+-- A registered worker, and whether it sleeps by its schedule.
+SELECT *, asleep_at(name, now()) AS asleep FROM workers WHERE id = %(id)s;
 
 -- name: see_worker
 -- A worker was seen now; to the second is enough.
@@ -202,12 +189,13 @@ UPDATE workers SET seen = now() WHERE id = %(id)s AND set_config('synchronous_co
 UPDATE tasks
 SET heartbeat = now(), progress = COALESCE(%(progress)s, progress)
 FROM jobs
-WHERE tasks.id = %(id)s AND tasks.attempt = %(attempt)s AND tasks.state = 'active' AND jobs.id = tasks.job_id
+WHERE tasks.id = %(task_id)s AND tasks.attempt = %(attempt)s AND tasks.state = 'active' AND jobs.id = tasks.job_id
 RETURNING jobs.state AS job_state;
 
 -- name: add_loss
 -- Remember a running attempt's loss; one that begins again from a checkpoint tells the same steps anew.
-INSERT INTO losses (task_id, step, loss) VALUES (%(task_id)s, %(step)s, %(loss)s)
+INSERT INTO losses (task_id, step, loss)
+SELECT id, %(step)s, %(loss)s FROM tasks WHERE id = %(task_id)s AND attempt = %(attempt)s AND state = 'active'
 ON CONFLICT (task_id, step) DO UPDATE SET loss = excluded.loss;
 
 -- name: drop_losses
