@@ -28,7 +28,7 @@ vec3 lkEvaluate(LkLobe lobe, vec3 v) {
 }
 
 // Evaluate an anisotropic lobe in the unit direction v (eq. 20 with squared dot products).
-float lkEvaluate(LkAnisotropicLobe lobe, vec3 v) {
+float lkEvaluateAnisotropic(LkAnisotropicLobe lobe, vec3 v) {
   float x = dot(v, lobe.x);
   float y = dot(v, lobe.y);
   return lobe.amplitude * max(dot(v, lobe.z), 0.0) * exp(-lobe.sharpness.x * x * x - lobe.sharpness.y * y * y);

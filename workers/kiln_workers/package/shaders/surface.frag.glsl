@@ -47,9 +47,9 @@ out vec4 fragmentRadiance;
 
 // The shading normal on the side of the eye; the triangle's own where the interpolated one faces away.
 vec3 seenNormal(vec3 o) {
+  vec3 face = normalize(cross(dFdx(vPosition), dFdy(vPosition)));
   vec3 normal = normalize(vNormal) * (gl_FrontFacing ? 1.0 : -1.0);
   if (dot(normal, o) > 0.0) return normal;
-  vec3 face = normalize(cross(dFdx(vPosition), dFdy(vPosition)));
   return dot(face, o) < 0.0 ? -face : face;
 }
 
