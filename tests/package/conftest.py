@@ -1,9 +1,11 @@
 """A synthetic bake as arrays (two charts, lobes of known shape, noisy images), and the independent readers from npm."""
 
 import json
+import multiprocessing
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,6 +66,13 @@ def node_tools(tmp_path_factory: pytest.TempPathFactory) -> NodeTools:
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=180)
     assert done.returncode == 0, f"npm could not install the readers that package.json pins:\n{done.stderr}"
     return NodeTools(folder)
+
+
+@pytest.fixture(scope="session")
+def native() -> Iterator[Callable[..., Any]]:
+    """Call a function of `native_shaders` in the process that is set aside for them; what it returns."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+        yield lambda function, *arguments: process.submit(function, *arguments).result(timeout=60)
 
 
 @pytest.fixture

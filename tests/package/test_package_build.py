@@ -25,11 +25,11 @@ WITHOUT_ENVIRONMENT = {
     "scene.glb",
     "report.html",
     "manifest.json",
-    "shaders/sg.glsl",
-    "shaders/environment.glsl",
-    "shaders/lightkiln.glsl",
+    *(f"shaders/{stem}.{ending}" for stem in ("sg", "environment", "lightkiln") for ending in ("glsl", "hlsl", "wgsl")),
     "shaders/surface.vert.glsl",
     "shaders/surface.frag.glsl",
+    "shaders/surface.hlsl",
+    "shaders/surface.wgsl",
 }
 WITH_ENVIRONMENT = WITHOUT_ENVIRONMENT | {"visibility.ktx2", "environment_ggx.ktx2", "environment_u.ktx2"}
 

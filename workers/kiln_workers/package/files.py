@@ -22,6 +22,8 @@ MEDIA_TYPES: Final = {
     ".xml": "application/xml",
     ".png": "image/png",
     ".glsl": "text/plain; charset=utf-8",
+    ".hlsl": "text/plain; charset=utf-8",
+    ".wgsl": "text/plain; charset=utf-8",
 }
 
 

@@ -1,15 +1,19 @@
-"""The GLSL that a package carries: the files, and how they go together into a program.
+"""The shaders that a package carries in GLSL, HLSL and WGSL, and how the GLSL goes together into a program.
 
-GLSL ES has no `#include`; the files are concatenated in the order of FRAGMENT_PARTS after a version line and default
-precisions (sampler2DArray has none of its own in ES 3.00).
+HLSL files include each other; the others are concatenated in the order of `includes`, GLSL after a version line and
+default precisions (sampler2DArray has none of its own in ES 3.00). The three languages are kept in step by tests that
+evaluate them on the same inputs.
 """
 
 from importlib.resources import files
 from typing import Final
 
-INCLUDES: Final = ("sg.glsl", "environment.glsl", "lightkiln.glsl")
-VERTEX_PARTS: Final = ("surface.vert.glsl",)
-FRAGMENT_PARTS: Final = (*INCLUDES, "surface.frag.glsl")
+EXAMPLES: Final = {
+    "glsl": ("surface.vert.glsl", "surface.frag.glsl"),
+    "hlsl": ("surface.hlsl",),
+    "wgsl": ("surface.wgsl",),
+}
+"""By language the files of a whole program that shades a package."""
 
 _HEAD: Final = """#version 300 es
 precision highp float;
@@ -20,6 +24,11 @@ precision highp samplerCube;
 """
 
 
+def includes(language: str) -> tuple[str, ...]:
+    """The files to include, each after those that it needs."""
+    return tuple(f"{stem}.{language}" for stem in ("sg", "environment", "lightkiln"))
+
+
 def source(name: str) -> str:
     """The text of one shader file."""
     return (files("kiln_workers.package") / "shaders" / name).read_text(encoding="utf-8")
@@ -27,15 +36,15 @@ def source(name: str) -> str:
 
 def sources() -> dict[str, str]:
     """Every shader file of a package by its name."""
-    return {name: source(name) for name in (*FRAGMENT_PARTS, *VERTEX_PARTS)}
+    return {name: source(name) for language in EXAMPLES for name in (*includes(language), *EXAMPLES[language])}
 
 
 def vertex_program() -> str:
-    """The example's vertex stage, complete."""
-    return _HEAD + "".join(source(name) for name in VERTEX_PARTS)
+    """The example's vertex stage in GLSL, complete."""
+    return _HEAD + source("surface.vert.glsl")
 
 
 def fragment_program(*, environment: bool) -> str:
-    """The example's fragment stage, complete; `environment` adds the reflections of the environment."""
+    """The example's fragment stage in GLSL, complete; `environment` adds the reflections of the environment."""
     define = "#define LK_ENVIRONMENT\n" if environment else ""
-    return _HEAD + define + "".join(source(name) for name in FRAGMENT_PARTS)
+    return _HEAD + define + "".join(source(name) for name in (*includes("glsl"), "surface.frag.glsl"))

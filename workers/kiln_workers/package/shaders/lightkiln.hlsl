@@ -1,0 +1,111 @@
+// Shading from lightkiln's textures. HLSL for shader model 4 and newer.
+//
+// Source: Currius et al. 2020, section 6. Bind lightfield.ktx2 and visibility.ktx2 as Texture2DArray, irradiance.ktx2 as
+// Texture2D, each with a sampler that filters linearly and clamps; look all three up with TEXCOORD_1 of scene.glb. All
+// radiance is linear Rec.709 in the scene's units. Directions are unit vectors in world space, as glTF has it: n the
+// shading normal, o to the eye. alpha = roughness * roughness. Textures are sampled at level 0, so that every stage may.
+
+#ifndef LK_LIGHTKILN_HLSL
+#define LK_LIGHTKILN_HLSL
+
+#include "sg.hlsl"
+#include "environment.hlsl"
+
+struct LkSurface {
+  float3 normal;
+  float3 baseColor;
+  float metallic;
+  float roughness;
+};
+
+// Fetch lobe `index`, bilinearly interpolated between texels: layer 2k holds axis and sharpness, 2k + 1 the amplitude.
+// An interpolated axis is shorter than 1 and is normalised again.
+LkLobe lkFetchLobe(Texture2DArray lobes, SamplerState lobesSampler, float2 uv, int index) {
+  float4 shape = lobes.SampleLevel(lobesSampler, float3(uv, float(2 * index)), 0.0);
+  float3 amplitude = lobes.SampleLevel(lobesSampler, float3(uv, float(2 * index + 1)), 0.0).rgb;
+  float norm = length(shape.xyz);
+  LkLobe lobe;
+  lobe.axis = norm > 1e-6 ? shape.xyz / norm : float3(0.0, 1.0, 0.0);
+  lobe.sharpness = max(shape.w, 0.0);
+  lobe.amplitude = max(amplitude, 0.0);
+  return lobe;
+}
+
+// Sum of all lobes at uv in a direction: incident radiance, or visibility of the environment.
+float3 lkLobeSum(Texture2DArray lobes, SamplerState lobesSampler, int count, float2 uv, float3 direction) {
+  float3 sum = 0.0;
+  for (int k = 0; k < count; k++) sum += lkEvaluate(lkFetchLobe(lobes, lobesSampler, uv, k), direction);
+  return sum;
+}
+
+// Reflectance at normal incidence of a glTF metallic-roughness surface.
+float3 lkF0(LkSurface surface) {
+  return lerp(0.04, surface.baseColor, surface.metallic);
+}
+
+// The single-scattering albedo of GGX: the integral over i of D G F / (4 n.o), F0 A + B with A and B rational in o.n
+// and alpha (the form of MaterialX' mx_ggx_dir_albedo_analytic, coefficients our own; within 2 % for alpha 0.04 to 1).
+// The paper takes F and G at the specular direction instead (step 5 of section 6), which loses up to half of the light.
+float3 lkReflectance(LkSurface surface, float3 o) {
+  float x = clamp(dot(surface.normal, o), 1e-4, 1.0);
+  float y = max(surface.roughness * surface.roughness, 0.04);
+  float4 fit = float4(0.079654, 0.82584, 1.0, 1.0);
+  fit += float4(-2.112, -1.9157, -2.3351, -2.4264) * (x);
+  fit += float4(10.725, 0.021977, 9.5778, 10.771) * (y);
+  fit += float4(-5.696, 0.58532, 0.54603, -6.4866) * (x * y);
+  fit += float4(40.966, 1.088, 39.229, 18.855) * (x * x);
+  fit += float4(-8.8396, 0.14768, -8.5177, 11.302) * (y * y);
+  fit += float4(-40.58, -0.52883, -36.547, -51.571) * (x * x * y);
+  fit += float4(24.516, -0.68548, 28.513, 105.32) * (x * y * y);
+  fit += float4(-2.1546, 0.42731, 23.074, 52.019) * (x * x * y * y);
+  float2 ab = saturate(fit.xy / fit.zw);
+  return lkF0(surface) * ab.x + ab.y;
+}
+
+// Glossy reflection of the scene: the mean of each lobe of the light field under D G (n.i) (steps 3 to 6 of section 6).
+float3 lkInterreflection(Texture2DArray lightField, SamplerState lightFieldSampler, int count, float2 uv,
+                         LkSurface surface, float3 o) {
+  LkReflection reflection = lkReflection(surface.normal, o, surface.roughness * surface.roughness);
+  float3 sum = 0.0;
+  for (int k = 0; k < count; k++) sum += lkMeanUnder(lkFetchLobe(lightField, lightFieldSampler, uv, k), reflection);
+  return sum * lkReflectance(surface, o);
+}
+
+// Where a glossy surface gathers most of its light from: the specular direction of a mirror, nearer to the normal for a
+// rough surface seen from the side (Lagarde and de Rousiers 2014 call it the dominant direction).
+float3 lkGlossyDirection(LkSurface surface, float3 o) {
+  LkReflection reflection = lkReflection(surface.normal, o, surface.roughness * surface.roughness);
+  return normalize(lerp(reflection.peak.z, reflection.tail.z, reflection.tailShare));
+}
+
+// Glossy reflection of the environment as if nothing were before it: U over the integral of D, 4 / (1 + alpha^2), times
+// the albedo (eq. 4). u is lkEnvironmentU in lkGlossyDirection.
+float3 lkEnvironmentUnoccluded(LkSurface surface, float3 o, float3 u) {
+  float alpha = surface.roughness * surface.roughness;
+  return u * (0.25 * (1.0 + alpha * alpha)) * lkReflectance(surface, o);
+}
+
+// The same times visibility (eq. 8).
+float3 lkEnvironmentReflection(Texture2DArray visibility, SamplerState visibilitySampler, int count, float2 uv,
+                               LkSurface surface, float3 o, float3 u) {
+  float3 direction = lkGlossyDirection(surface, o);
+  return lkEnvironmentUnoccluded(surface, o, u) * lkLobeSum(visibility, visibilitySampler, count, uv, direction);
+}
+
+// The same from the GGX cube map, whose mips are means. mean is lkEnvironmentGgx in lkGlossyDirection.
+float3 lkEnvironmentSplitSum(Texture2DArray visibility, SamplerState visibilitySampler, int count, float2 uv,
+                             LkSurface surface, float3 o, float3 mean) {
+  float3 direction = lkGlossyDirection(surface, o);
+  return mean * lkLobeSum(visibility, visibilitySampler, count, uv, direction) * lkReflectance(surface, o);
+}
+
+// Diffuse reflection of the baked irradiance (W/m^2), without what the specular layer reflects: 1 - F(o.h) averaged over
+// the hemisphere is 0.959 - 0.0266 (1 - o.n)^3 within 0.001.
+float3 lkDiffuse(Texture2D irradiance, SamplerState irradianceSampler, float2 uv, LkSurface surface, float3 o) {
+  float away = 1.0 - saturate(dot(surface.normal, o));
+  float transmitted = 0.95903 - 0.02659 * away * away * away;
+  float3 arriving = irradiance.SampleLevel(irradianceSampler, uv, 0.0).rgb;
+  return arriving * surface.baseColor * (1.0 - surface.metallic) * transmitted / LK_PI;
+}
+
+#endif

@@ -1,0 +1,117 @@
+// Shading from lightkiln's textures. WGSL; concatenate after sg.wgsl and environment.wgsl.
+//
+// Source: Currius et al. 2020, section 6. Bind lightfield.ktx2 and visibility.ktx2 as texture_2d_array<f32>,
+// irradiance.ktx2 as texture_2d<f32>, each with a sampler that filters linearly and clamps; look all three up with
+// TEXCOORD_1 of scene.glb. All radiance is linear Rec.709 in the scene's units. Directions are unit vectors in world
+// space, as glTF has it: n the shading normal, o to the eye. alpha = roughness * roughness. Textures are sampled at level
+// 0, so that every stage may, in any control flow.
+
+struct LkSurface {
+  normal: vec3f,
+  baseColor: vec3f,
+  metallic: f32,
+  roughness: f32,
+}
+
+// Fetch lobe `index`, bilinearly interpolated between texels: layer 2k holds axis and sharpness, 2k + 1 the amplitude.
+// An interpolated axis is shorter than 1 and is normalised again.
+fn lkFetchLobe(lobes: texture_2d_array<f32>, lobesSampler: sampler, uv: vec2f, index: i32) -> LkLobe {
+  let shape = textureSampleLevel(lobes, lobesSampler, uv, 2 * index, 0.0);
+  let amplitude = textureSampleLevel(lobes, lobesSampler, uv, 2 * index + 1, 0.0).rgb;
+  let norm = length(shape.xyz);
+  var axis = vec3f(0.0, 1.0, 0.0);
+  if (norm > 1e-6) {
+    axis = shape.xyz / norm;
+  }
+  return LkLobe(axis, max(shape.w, 0.0), max(amplitude, vec3f(0.0)));
+}
+
+// Sum of all lobes at uv in a direction: incident radiance, or visibility of the environment.
+fn lkLobeSum(
+  lobes: texture_2d_array<f32>, lobesSampler: sampler, count: i32, uv: vec2f, direction: vec3f,
+) -> vec3f {
+  var sum = vec3f(0.0);
+  for (var k = 0; k < count; k++) {
+    sum += lkEvaluate(lkFetchLobe(lobes, lobesSampler, uv, k), direction);
+  }
+  return sum;
+}
+
+// Reflectance at normal incidence of a glTF metallic-roughness surface.
+fn lkF0(surface: LkSurface) -> vec3f {
+  return mix(vec3f(0.04), surface.baseColor, surface.metallic);
+}
+
+// The single-scattering albedo of GGX: the integral over i of D G F / (4 n.o), F0 A + B with A and B rational in o.n
+// and alpha (the form of MaterialX' mx_ggx_dir_albedo_analytic, coefficients our own; within 2 % for alpha 0.04 to 1).
+// The paper takes F and G at the specular direction instead (step 5 of section 6), which loses up to half of the light.
+fn lkReflectance(surface: LkSurface, o: vec3f) -> vec3f {
+  let x = clamp(dot(surface.normal, o), 1e-4, 1.0);
+  let y = max(surface.roughness * surface.roughness, 0.04);
+  var fit = vec4f(0.079654, 0.82584, 1.0, 1.0);
+  fit += vec4f(-2.112, -1.9157, -2.3351, -2.4264) * (x);
+  fit += vec4f(10.725, 0.021977, 9.5778, 10.771) * (y);
+  fit += vec4f(-5.696, 0.58532, 0.54603, -6.4866) * (x * y);
+  fit += vec4f(40.966, 1.088, 39.229, 18.855) * (x * x);
+  fit += vec4f(-8.8396, 0.14768, -8.5177, 11.302) * (y * y);
+  fit += vec4f(-40.58, -0.52883, -36.547, -51.571) * (x * x * y);
+  fit += vec4f(24.516, -0.68548, 28.513, 105.32) * (x * y * y);
+  fit += vec4f(-2.1546, 0.42731, 23.074, 52.019) * (x * x * y * y);
+  let ab = saturate(fit.xy / fit.zw);
+  return lkF0(surface) * ab.x + ab.y;
+}
+
+// Glossy reflection of the scene: the mean of each lobe of the light field under D G (n.i) (steps 3 to 6 of section 6).
+fn lkInterreflection(
+  lightField: texture_2d_array<f32>, lightFieldSampler: sampler, count: i32, uv: vec2f, surface: LkSurface, o: vec3f,
+) -> vec3f {
+  let reflection = lkReflection(surface.normal, o, surface.roughness * surface.roughness);
+  var sum = vec3f(0.0);
+  for (var k = 0; k < count; k++) {
+    sum += lkMeanUnder(lkFetchLobe(lightField, lightFieldSampler, uv, k), reflection);
+  }
+  return sum * lkReflectance(surface, o);
+}
+
+// Where a glossy surface gathers most of its light from: the specular direction of a mirror, nearer to the normal for a
+// rough surface seen from the side (Lagarde and de Rousiers 2014 call it the dominant direction).
+fn lkGlossyDirection(surface: LkSurface, o: vec3f) -> vec3f {
+  let reflection = lkReflection(surface.normal, o, surface.roughness * surface.roughness);
+  return normalize(mix(reflection.peak.z, reflection.tail.z, reflection.tailShare));
+}
+
+// Glossy reflection of the environment as if nothing were before it: U over the integral of D, 4 / (1 + alpha^2), times
+// the albedo (eq. 4). u is lkEnvironmentU in lkGlossyDirection.
+fn lkEnvironmentUnoccluded(surface: LkSurface, o: vec3f, u: vec3f) -> vec3f {
+  let alpha = surface.roughness * surface.roughness;
+  return u * (0.25 * (1.0 + alpha * alpha)) * lkReflectance(surface, o);
+}
+
+// The same times visibility (eq. 8).
+fn lkEnvironmentReflection(
+  visibility: texture_2d_array<f32>, visibilitySampler: sampler, count: i32, uv: vec2f, surface: LkSurface, o: vec3f,
+  u: vec3f,
+) -> vec3f {
+  let direction = lkGlossyDirection(surface, o);
+  return lkEnvironmentUnoccluded(surface, o, u) * lkLobeSum(visibility, visibilitySampler, count, uv, direction);
+}
+
+// The same from the GGX cube map, whose mips are means. mean is lkEnvironmentGgx in lkGlossyDirection.
+fn lkEnvironmentSplitSum(
+  visibility: texture_2d_array<f32>, visibilitySampler: sampler, count: i32, uv: vec2f, surface: LkSurface, o: vec3f,
+  mean: vec3f,
+) -> vec3f {
+  let direction = lkGlossyDirection(surface, o);
+  return mean * lkLobeSum(visibility, visibilitySampler, count, uv, direction) * lkReflectance(surface, o);
+}
+
+// Diffuse reflection of the baked irradiance (W/m^2), without what the specular layer reflects: 1 - F(o.h) averaged over
+// the hemisphere is 0.959 - 0.0266 (1 - o.n)^3 within 0.001.
+fn lkDiffuse(
+  irradiance: texture_2d<f32>, irradianceSampler: sampler, uv: vec2f, surface: LkSurface, o: vec3f,
+) -> vec3f {
+  let away = 1.0 - saturate(dot(surface.normal, o));
+  let transmitted = 0.95903 - 0.02659 * away * away * away;
+  let arriving = textureSampleLevel(irradiance, irradianceSampler, uv, 0.0).rgb;
+  return arriving * surface.baseColor * (1.0 - surface.metallic) * transmitted / LK_PI;
+}
