@@ -8,11 +8,14 @@ import ctypes
 import functools
 import importlib.util
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shader_probes
+from shader_probes import Image
 
 CHROMIUM = Path("/usr/lib/chromium")
 
@@ -55,9 +58,9 @@ def check(code: str | bytes) -> None:
         raise ValueError(str(error)) from None
 
 
-def run(code: str | bytes, inputs: np.ndarray, textures: Mapping[str, shader_probes.Image]) -> np.ndarray:
+def run(code: str | bytes, inputs: np.ndarray, textures: Mapping[str, Image]) -> np.ndarray:
     """What a probe program writes: float32 [rows, P, 4]."""
-    from wgpu import BufferUsage, TextureUsage
+    from wgpu import BufferUsage
 
     device = _device()
     pipeline = device.create_compute_pipeline(
@@ -66,30 +69,120 @@ def run(code: str | bytes, inputs: np.ndarray, textures: Mapping[str, shader_pro
     given = device.create_buffer_with_data(data=inputs, usage=BufferUsage.STORAGE)
     rows, points = len(shader_probes.ROWS), len(inputs)
     results = device.create_buffer(size=rows * points * 16, usage=BufferUsage.STORAGE | BufferUsage.COPY_SRC)
-    sampler = device.create_sampler(mag_filter="linear", min_filter="linear", mipmap_filter="linear")
-    resources = [{"buffer": given}, {"buffer": results}, sampler]
-    for image in textures.values():
-        layers, height, width, _ = image.levels[0].shape
-        texture = device.create_texture(
-            size=(width, height, layers),
-            mip_level_count=len(image.levels),
-            format="rgba16float",
-            usage=TextureUsage.TEXTURE_BINDING | TextureUsage.COPY_DST,
-        )
-        for mip, level in enumerate(image.levels):
-            layers, height, width, _ = level.shape
-            layout = {"bytes_per_row": width * 8, "rows_per_image": height}
-            device.queue.write_texture({"texture": texture, "mip_level": mip}, level, layout, (width, height, layers))
-        resources.append(texture.create_view(dimension=image.dimension))
-    group = device.create_bind_group(
-        layout=pipeline.get_bind_group_layout(0),
-        entries=[{"binding": binding, "resource": resource} for binding, resource in enumerate(resources)],
-    )
+    views = [_view(image) for image in textures.values()]
+    resources = [{"buffer": given}, {"buffer": results}, _sampler(), *views]
     encoder = device.create_command_encoder()
     compute = encoder.begin_compute_pass()
     compute.set_pipeline(pipeline)
-    compute.set_bind_group(0, group)
+    compute.set_bind_group(0, _group(pipeline, 0, dict(enumerate(resources))))
     compute.dispatch_workgroups(points // 64, rows)
     compute.end()
     device.queue.submit([encoder.finish()])
     return np.frombuffer(device.queue.read_buffer(results), np.float32).reshape(rows, points, 4)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A mesh and its material, as the example programs take them."""
+
+    vertices: np.ndarray  # float32 [V, 10] position, normal, TEXCOORD_0, TEXCOORD_1
+    indices: np.ndarray  # uint32 [F, 3]
+    material: bytes
+    maps: tuple[Image, Image, Image]  # base colour, metallic and roughness, emission
+    wrap: tuple[str, str]  # WebGPU's names
+
+
+@dataclass(frozen=True)
+class Stage:
+    code: str | bytes
+    entry: str
+
+
+def draw(
+    stages: tuple[Stage, Stage],
+    uniforms: Mapping[int, bytes],
+    light: Mapping[int, Image],
+    meshes: Sequence[Drawn],
+    size: tuple[int, int],
+) -> np.ndarray:
+    """The picture float32 [H, W, 4] that an example program draws; bindings are numbered as in surface.wgsl."""
+    from wgpu import BufferUsage, TextureUsage
+
+    device, (width, height) = _device(), size
+    vertex, fragment = (
+        {"module": device.create_shader_module(code=stage.code), "entry_point": stage.entry} for stage in stages
+    )
+    offsets = zip((0, 12, 24, 32), ("float32x3", "float32x3", "float32x2", "float32x2"), strict=True)
+    attributes = [{"shader_location": k, "offset": at, "format": of} for k, (at, of) in enumerate(offsets)]
+    pipeline = device.create_render_pipeline(
+        layout="auto",
+        vertex=vertex | {"buffers": [{"array_stride": 40, "attributes": attributes}]},
+        fragment=fragment | {"targets": [{"format": "rgba32float"}]},
+        depth_stencil={"format": "depth32float", "depth_write_enabled": True, "depth_compare": "less"},
+    )
+    picture, depth = (
+        device.create_texture(
+            size=(width, height, 1), format=of, usage=TextureUsage.RENDER_ATTACHMENT | TextureUsage.COPY_SRC
+        )
+        for of in ("rgba32float", "depth32float")
+    )
+    encoder = device.create_command_encoder()
+    drawing = encoder.begin_render_pass(
+        color_attachments=[{"view": picture.create_view(), "load_op": "clear", "store_op": "store"}],
+        depth_stencil_attachment={
+            "view": depth.create_view(),
+            "depth_clear_value": 1.0,
+            "depth_load_op": "clear",
+            "depth_store_op": "store",
+        },
+    )
+    drawing.set_pipeline(pipeline)
+
+    def buffer(data: bytes | np.ndarray, usage: int) -> Any:
+        return device.create_buffer_with_data(data=data, usage=usage)
+
+    shared = {at: {"buffer": buffer(data, BufferUsage.UNIFORM | BufferUsage.STORAGE)} for at, data in uniforms.items()}
+    shared |= {at: _view(image) for at, image in light.items()} | {6: _sampler()}
+    drawing.set_bind_group(0, _group(pipeline, 0, shared))
+    for mesh in meshes:
+        maps = dict(enumerate(map(_view, mesh.maps), start=1))
+        own = {0: {"buffer": buffer(mesh.material, BufferUsage.UNIFORM)}, **maps, 4: _sampler(mesh.wrap)}
+        drawing.set_bind_group(1, _group(pipeline, 1, own))
+        drawing.set_vertex_buffer(0, buffer(mesh.vertices, BufferUsage.VERTEX))
+        drawing.set_index_buffer(buffer(mesh.indices, BufferUsage.INDEX), "uint32")
+        drawing.draw_indexed(mesh.indices.size)
+    drawing.end()
+    device.queue.submit([encoder.finish()])
+    layout = {"bytes_per_row": width * 16, "rows_per_image": height}
+    data = device.queue.read_texture({"texture": picture}, layout, (width, height, 1))
+    return np.frombuffer(data, np.float32).reshape(height, width, 4)
+
+
+def _group(pipeline: Any, number: int, resources: Mapping[int, Any]) -> Any:
+    entries = [{"binding": binding, "resource": resource} for binding, resource in resources.items()]
+    return _device().create_bind_group(layout=pipeline.get_bind_group_layout(number), entries=entries)
+
+
+def _sampler(wrap: tuple[str, str] = ("clamp-to-edge", "clamp-to-edge")) -> Any:
+    """Linear in all ways."""
+    linear = dict.fromkeys(("mag_filter", "min_filter", "mipmap_filter"), "linear")
+    return _device().create_sampler(address_mode_u=wrap[0], address_mode_v=wrap[1], **linear)
+
+
+def _view(image: Image) -> Any:
+    """A texture on the device."""
+    from wgpu import TextureUsage
+
+    device = _device()
+    layers, height, width, _ = image.levels[0].shape
+    texture = device.create_texture(
+        size=(width, height, layers),
+        mip_level_count=len(image.levels),
+        format="rgba16float",
+        usage=TextureUsage.TEXTURE_BINDING | TextureUsage.COPY_DST,
+    )
+    for mip, level in enumerate(image.levels):
+        layers, height, width, _ = level.shape
+        layout = {"bytes_per_row": width * 8, "rows_per_image": height}
+        device.queue.write_texture({"texture": texture, "mip_level": mip}, level, layout, (width, height, layers))
+    return texture.create_view(dimension=image.dimension)

@@ -75,15 +75,34 @@ void main() { gl_Position = vec4(vec2(gl_VertexID % 2, gl_VertexID / 2) * 4.0 - 
   return base64(results);
 };
 
-// WebGPU: a compute shader over points and rows.
-window.runWgsl = async (job) => {
+// A WebGPU device and a module that it compiled without a warning.
+async function compiled(code) {
   const adapter = await navigator.gpu?.requestAdapter();
   if (!adapter) throw new Error("no WebGPU adapter here");
   const device = await adapter.requestDevice();
-  const code = device.createShaderModule({ code: job.code });
-  const faults = (await code.getCompilationInfo()).messages.map(({ lineNum, message }) => `${lineNum}: ${message}`);
+  const module = device.createShaderModule({ code });
+  const faults = (await module.getCompilationInfo()).messages.map(({ lineNum, message }) => `${lineNum}: ${message}`);
   if (faults.length) throw new Error(faults.join("\n"));
-  const pipeline = await device.createComputePipelineAsync({ layout: "auto", compute: { module: code } });
+  return { device, module };
+}
+
+// Throws unless a program makes a pipeline with the vertices of surface.wgsl.
+window.checkExample = async (code) => {
+  const { device, module } = await compiled(code);
+  const formats = ["float32x3", "float32x3", "float32x2", "float32x2"];
+  const attributes = formats.map((format, k) => ({ format, shaderLocation: k, offset: [0, 12, 24, 32][k] }));
+  await device.createRenderPipelineAsync({
+    layout: "auto",
+    vertex: { module, buffers: [{ arrayStride: 40, attributes }] },
+    fragment: { module, targets: [{ format: "rgba16float" }] },
+  });
+  device.destroy();
+};
+
+// WebGPU: a compute shader over points and rows.
+window.runWgsl = async (job) => {
+  const { device, module } = await compiled(job.code);
+  const pipeline = await device.createComputePipelineAsync({ layout: "auto", compute: { module } });
   const storage = (size, usage) => device.createBuffer({ size, usage: usage | GPUBufferUsage.STORAGE });
   const inputs = storage(job.points * job.columns * 16, GPUBufferUsage.COPY_DST);
   device.queue.writeBuffer(inputs, 0, bytes(job.inputs));
