@@ -70,9 +70,9 @@ def node_tools(tmp_path_factory: pytest.TempPathFactory) -> NodeTools:
 
 @pytest.fixture(scope="session")
 def native() -> Iterator[Callable[..., Any]]:
-    """Call a function of `native_shaders` in the process that is set aside for them; what it returns."""
+    """Call a function in a process of its own, where compilers and drivers can do no harm; what it returns."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        yield lambda function, *arguments: process.submit(function, *arguments).result(timeout=60)
+        yield lambda function, *arguments: process.submit(function, *arguments).result(timeout=120)
 
 
 @pytest.fixture

@@ -1,12 +1,11 @@
-"""HLSL and WGSL without a browser: Microsoft's DXC makes SPIR-V of HLSL, and wgpu runs SPIR-V and WGSL by way of naga.
+"""WGSL and SPIR-V on a device without a browser: wgpu, whose compiler is naga.
 
 wgpu draws on Vulkan, for which chromium brings a software driver and its loader. Meant to run in a process of its own
-(`conftest.native`), as DXC exports an LLVM that others in the process may then take for theirs.
+(`conftest.native`), with the drivers' threads and libraries.
 """
 
 import ctypes
 import functools
-import importlib.util
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,24 +17,6 @@ import shader_probes
 from shader_probes import Image
 
 CHROMIUM = Path("/usr/lib/chromium")
-
-
-@functools.cache
-def _dxc():
-    """DXC as its package has it; the module looks the library up among those that are loaded."""
-    found = importlib.util.find_spec("compushady.backends")
-    assert found is not None and found.submodule_search_locations is not None
-    (library,) = Path(found.submodule_search_locations[0]).glob("libdxcompiler_*.so")
-    ctypes.CDLL(str(library), ctypes.RTLD_GLOBAL)
-    from compushady.backends import dxc
-
-    return dxc
-
-
-def compile_hlsl(source: str, entry: str, target: str) -> bytes:
-    """SPIR-V of one stage; ValueError with DXC's messages where it does not compile."""
-    spirv = 1
-    return _dxc().compile(source.encode(), entry, spirv, target)
 
 
 @functools.cache

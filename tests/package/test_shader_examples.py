@@ -7,6 +7,7 @@ import re
 import struct
 from pathlib import Path
 
+import dxc
 import native_shaders
 import numpy as np
 import packages
@@ -98,7 +99,7 @@ def test_the_example_draws_the_evaluator_s_picture(language: str, folder: Path, 
     text = program(language)
     if language == "hlsl":
         entries = (("vertexMain", "vs_6_0"), ("pixelMain", "ps_6_0"))
-        stages = tuple(native_shaders.Stage(native(native_shaders.compile_hlsl, text, *of), of[0]) for of in entries)
+        stages = tuple(native_shaders.Stage(native(dxc.compile_hlsl, text, *of, *dxc.SPIRV), of[0]) for of in entries)
     else:
         stages = tuple(native_shaders.Stage(text, entry) for entry in ("vertexMain", "fragmentMain"))
     light = {at: ktx2.read(folder / f"{name}.ktx2") for at, name in LIGHT.items()}

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import dxc
 import native_shaders
 import numpy as np
 import pytest
@@ -78,7 +79,7 @@ def run(page: Page, native, given, images) -> Run:
     def run(way: str, sources: Mapping[str, str]) -> np.ndarray:
         code = shader_probes.program(WAYS[way], sources)
         if way == "DXC":
-            code = native(native_shaders.compile_hlsl, code, "main", "cs_6_0")
+            code = native(dxc.compile_hlsl, code, "main", "cs_6_0", *dxc.SPIRV)
         if way in ("DXC", "naga"):
             return native(native_shaders.run, code, inputs, images)
         text = page.evaluate("runGlsl" if way == "WebGL2" else "runWgsl", job | {"code": code})
