@@ -180,9 +180,9 @@ class Worker:
             case Ready(lacks=lacks) if lacks is not None:
                 raise KilnError.from_problem(lacks)
             case Ended():
+                reasons = filter(None, (answer.sentence(), " | ".join(list(child.tail)[-3:])))
                 raise MachineLacks(
-                    f"the renderer does not start: {answer.sentence()}; {' | '.join(list(child.tail)[-3:])}",
-                    remedy="Run `lightkiln doctor`.",
+                    f"the renderer does not start: {'; '.join(reasons)}", remedy="Run `lightkiln doctor`."
                 )
             case _:
                 raise InternalError(f"the child's first line is {type(answer).__name__}")
