@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -36,6 +37,18 @@ def test_a_drained_worker_leaves_by_itself(coordinator, stages_path, worker_prog
     coordinator.refuse["claim"] = Drained("an operator told the worker to leave")
     done = subprocess.run(worker_program, timeout=60)
     assert done.returncode == 0 and coordinator.named("/fail") == []
+
+
+def test_a_worker_has_the_name_of_the_one_that_it_follows(coordinator, tmp_path: Path) -> None:
+    """Blocks and schedules go by names: a worker that was started again is still the same."""
+    coordinator.refuse["claim"] = Drained("an operator told the worker to leave")
+    command = [sys.executable, "-m", "kiln_workers", "worker", "--url", coordinator.url, "--scratch", str(tmp_path)]
+    for _ in range(2):
+        environment = os.environ | {"LIGHTKILN_TOKEN": "secret"}
+        done = subprocess.run(command, timeout=120, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    first, second = (registration["name"] for registration in coordinator.named("/workers"))
+    assert first == second == f"{platform.node()}-0"
 
 
 def test_a_killed_worker_takes_its_child_along(coordinator, stages_path, worker_program: list[str], running) -> None:

@@ -53,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
     worker.add_argument("--tag", action="append", default=[], help="what it is good for, for jobs that require it")
     worker.add_argument("--memory", help="main memory to use, e.g. 4GiB")
     worker.add_argument("--threads", type=int, help="cores to use; all by default")
-    worker.add_argument("--name", help="as the dashboard shows it; host name and process by default")
+    worker.add_argument("--name", help="as the dashboard shows it; the host's and a number by default")
     worker.add_argument("--scratch", type=Path, help="folder for temporary files and the blob cache")
     worker.add_argument(
         "--log-format",
@@ -98,7 +98,7 @@ def _worker(options: argparse.Namespace) -> int:
             WorkerOptions(
                 url=options.url,
                 token=token,
-                name=options.name or f"{platform.node()}-{os.getpid()}",
+                name=options.name or f"{platform.node()}-{folder.name}",
                 kinds=kinds,
                 tags=read_tags(options.tag),
                 memory_bytes=memory,
