@@ -142,7 +142,7 @@ class Signals:
 
     @contextlib.contextmanager
     def watch(self, channel: str, wanted: Collection[str] = ()) -> Iterator[asyncio.Event]:
-        """An event that `wake` sets, for the time of the block; for the queue, by tasks of the kinds `wanted`."""
+        """An event that `wake` sets, for the time of the block; for the queue, by kinds of tasks and ids."""
         event = asyncio.Event()
         self._waiting[channel][event] = frozenset(wanted)
         try:

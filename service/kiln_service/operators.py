@@ -21,6 +21,7 @@ from kiln_schemas.operators import (
     WorkerState,
     WorkerView,
 )
+from kiln_service import queue
 from kiln_service.config import OWN_TOKEN, ServiceConfig
 from kiln_service.db import Database, Tx, picked
 
@@ -89,6 +90,7 @@ async def order_worker(database: Database, worker_id: str, order: Order, actor: 
         row = await tx.maybe("order_worker", id=worker_id, orders=_ORDERS[order])
         if row is None:
             raise NotFound(f"no worker '{worker_id}'", where="worker", remedy="GET /v1/workers lists them.")
+        await queue.tell(tx, worker_id)
         await record(tx, actor, f"worker.{order.value}", row["name"], {"worker": worker_id})
 
 

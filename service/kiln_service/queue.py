@@ -41,4 +41,9 @@ async def pick(
 
 async def announce(tx: Tx, kinds: Collection[TaskKind]) -> None:
     """Wake the claims that wait, once the transaction is committed: tasks of these kinds may be claimed."""
-    await tx.run("notify_queued", kinds=",".join(sorted(kind.value for kind in kinds)))
+    await tx.run("notify_queued", about=",".join(sorted(kind.value for kind in kinds)))
+
+
+async def tell(tx: Tx, worker_id: str) -> None:
+    """Wake the claim of one worker, once the transaction is committed: it has other orders."""
+    await tx.run("notify_queued", about=worker_id)

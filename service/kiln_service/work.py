@@ -83,7 +83,7 @@ class Work:
         `is_gone` tells whether the worker hung up: a task given to nobody would wait for the reaper.
         """
         deadline = time.monotonic() + request.wait_s
-        with self._signals.watch(QUEUED_CHANNEL, request.kinds) as woken:
+        with self._signals.watch(QUEUED_CHANNEL, [*request.kinds, worker_id]) as woken:
             while True:
                 woken.clear()
                 if await is_gone():

@@ -1,12 +1,14 @@
 """What operators do: tokens that come and go, orders to workers, the record, metrics."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from kiln_service import auth
+from kiln_service.config import Timing
 
 
 def make(home, name="ci", scopes=("submit",)):
@@ -99,6 +101,23 @@ def test_a_drained_worker_finishes_its_task_and_is_told_to_leave(home):
     assert refused.status_code == 409 and refused.json()["code"] == "drained"
     home.sql("UPDATE workers SET seen = now() - interval '2 minutes'")
     assert home.client.get("/v1/workers").json()[0]["state"] == "offline"
+
+
+def test_a_worker_that_waits_hears_its_orders_at_once(start):
+    """Not when its long poll ends, nor when it would look again by itself."""
+    with (
+        start(timing=Timing(heartbeat_s=0.2, stale_s=600, poll_s=60, maintenance_s=0.3)) as home,
+        ThreadPoolExecutor() as threads,
+    ):
+        worker, other = home.worker("one"), home.worker("other")
+        body = {"kinds": ["render"], "wait_s": 20}
+        waiting = threads.submit(home.client.post, f"/v1/workers/{worker.id}/claim", json=body)
+        others = threads.submit(other.claim, "render", wait_s=3)
+        time.sleep(1)
+        began = time.monotonic()
+        home.client.post(f"/v1/workers/{worker.id}/orders/drain").raise_for_status()
+        assert waiting.result().status_code == 409 and time.monotonic() - began < 10
+        assert others.result() is None, "the order is not theirs"
 
 
 def test_a_worker_of_another_version_is_refused(shared):

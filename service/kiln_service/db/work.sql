@@ -152,8 +152,8 @@ FROM tasks WHERE job_id = %(job_id)s AND kind = 'prepare' AND state = 'completed
 ANALYZE tasks;
 
 -- name: notify_queued
--- Wake the claims that wait.
-SELECT pg_notify('kiln_queued', %(kinds)s);
+-- Wake the claims that wait for any of these: kinds of tasks, or what a worker is told.
+SELECT pg_notify('kiln_queued', %(about)s);
 
 -- name: add_event
 -- Append to a job's history, wake who watches it and note whom to tell; the job is locked.
