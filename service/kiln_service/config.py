@@ -98,6 +98,8 @@ class Retention(Contract):
     """A job is archived so many days after its end."""
     free_days: float | None = Field(default=None, ge=0)
     """An archived job gives up its light fields so many days after its end; its package stays."""
+    log_days: float | None = Field(default=None, ge=0)
+    """What a job's tasks logged goes so many days after the job's end; its events stay."""
     keep: dict[str, str] = Field(default={"keep": "true"})
     """Jobs with one of these labels are left alone."""
     check_s: float = Field(default=3600.0, gt=0)

@@ -1,4 +1,4 @@
-"""Retention rules: jobs that are over are archived after a while, and archived ones give up their light fields.
+"""Retention rules: jobs that are over are archived after a while, archived ones give up their light fields, logs go.
 
 Run by the coordinator that leads (`maintenance`), by the functions that serve `archive` and `gc` asked for by hand:
 nothing that another job needs is freed. Jobs with a label of `Retention.keep` are left alone.
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 async def apply_rules(database: Database, config: ServiceConfig) -> None:
-    """One round of both rules; a rule without a number of days does nothing."""
+    """One round of all rules; a rule without a number of days does nothing."""
     rules = config.retention
     if rules.archive_days is not None:
         await _archive_old(database, config, rules.archive_days)
@@ -31,6 +31,12 @@ async def apply_rules(database: Database, config: ServiceConfig) -> None:
         )
         for freed in report.jobs:
             log.info("freed by the retention rules: %s", ", ".join(freed.stores), extra={"job_id": freed.job_id})
+    if rules.log_days is not None:
+        states = sorted(FINAL_JOB_STATES)
+        async with database.transaction() as tx:
+            dropped = await tx.count("drop_logs", states=states, days=rules.log_days, keep=Jsonb(rules.keep))
+        if dropped:
+            log.info("%d pieces of logs dropped by the retention rules", dropped)
 
 
 async def _archive_old(database: Database, config: ServiceConfig, days: float) -> None:

@@ -102,6 +102,21 @@ def aged(home, job_id, days):
     home.sql("UPDATE jobs SET finished = now() - make_interval(days => %s) WHERE id = %s", days, job_id)
 
 
+def test_logs_of_old_jobs_go_and_their_events_stay(start, eventually):
+    with start() as home:
+        young, old, kept = (baked(home, set=[f"render.samples={8 + n}"]) for n in range(3))
+        home.client.patch(f"/v1/jobs/{kept}", json={"labels": {"keep": "true"}}).raise_for_status()
+        tasks = {job: home.tasks(job)[0]["id"] for job in (young, old, kept)}
+        for job, days in ((young, 89), (old, 91), (kept, 1000)):
+            home.sql("INSERT INTO task_logs (task_id, attempt, lines) VALUES (%s, 1, 'said')", tasks[job])
+            aged(home, job, days)
+    with start(retention=Retention(log_days=90, check_s=0.1)) as home:
+        logs = {job: f"/v1/tasks/{task}/log" for job, task in tasks.items()}
+        eventually(lambda: home.client.get(logs[old]).text == "")
+        assert all("said" in home.client.get(logs[job]).text for job in (young, kept))
+        assert home.events(old)
+
+
 def test_retention_rules_archive_and_free_what_is_old_and_nothing_that_is_needed(start, eventually):
     rules = Retention(archive_days=30, free_days=60, check_s=0.1)
     with start() as home:
