@@ -50,7 +50,8 @@ class Manifest(Contract):
     left_out: dict[str, str] = Field(default_factory=dict)
     """Artifact or function to the reason why it is absent."""
     textures: dict[str, dict[str, Any]]
-    """Per KTX2 file: width, height, layers, lobes, channel meanings, `normalised` for environment_u."""
+    """Per KTX2 file: width, height, layers, lobes, channel meanings, `normalised` for environment_u; `environment.exr`
+    with its projection and orientation."""
     lightmap: dict[str, Any]
     """Resolution, texels covered, valid, invalid, charts, worst texel size in metres."""
     stage_seconds: dict[str, float]

@@ -96,7 +96,12 @@ class FitSettings(Contract):
 class PackageSettings(Contract):
     """What is written besides the textures."""
 
-    environment_size: int = Field(default=128, ge=16, le=1024, description="side of the GGX cube's largest mip")
+    environment_size: int = Field(
+        default=128,
+        ge=16,
+        le=1024,
+        description="side of the GGX cube's largest mip; environment.exr is 8 times as wide at most",
+    )
     supercompress: bool = Field(default=False, description="Zstandard inside the lobe textures")
 
 

@@ -19,7 +19,7 @@ TEXTURES = ("lightfield.ktx2", "visibility.ktx2", "irradiance.ktx2", "environmen
 def test_package_is_whole(baked: Path) -> None:
     manifest = json.loads((baked / "manifest.json").read_text())
     listed = {entry["name"]: entry for entry in manifest["files"]}
-    assert {*TEXTURES, "irradiance.exr", "scene.glb", "report.html"} <= listed.keys()
+    assert {*TEXTURES, "irradiance.exr", "environment.exr", "scene.glb", "report.html"} <= listed.keys()
     for name, entry in listed.items():
         data = (baked / name).read_bytes()
         assert (hashlib.sha256(data).hexdigest(), len(data)) == (entry["sha256"], entry["size"]), name

@@ -328,4 +328,7 @@ def _atlas(texel_map: FakeTexelMap) -> np.ndarray:
 def _environment(random: np.random.Generator) -> EnvironmentTextures:
     mips = [random.random((6, side, side, 3)).astype(np.float32) for side in (8, 4, 2, 1)]
     layers = random.random((3, 8, 8, 3)).astype(np.float32)
-    return EnvironmentTextures(mips, layers, (0.04, 0.25, 1.0), u_integrals=(3.9, 3.1, 1.5), u_normalised=False)
+    panorama = random.random((8, 16, 3)).astype(np.float32)
+    return EnvironmentTextures(
+        panorama, mips, layers, (0.04, 0.25, 1.0), u_integrals=(3.9, 3.1, 1.5), u_normalised=False
+    )

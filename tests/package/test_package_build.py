@@ -31,7 +31,8 @@ WITHOUT_ENVIRONMENT = {
     "shaders/surface.hlsl",
     "shaders/surface.wgsl",
 }
-WITH_ENVIRONMENT = WITHOUT_ENVIRONMENT | {"visibility.ktx2", "environment_ggx.ktx2", "environment_u.ktx2"}
+ENVIRONMENT = ("environment_ggx.ktx2", "environment_u.ktx2", "environment.exr")
+WITH_ENVIRONMENT = WITHOUT_ENVIRONMENT | {"visibility.ktx2", *ENVIRONMENT}
 
 
 def files_in(folder: Path) -> set[str]:
@@ -51,7 +52,7 @@ def test_artifacts_manifest_and_folder_agree(environment, names, make_sample, tm
     for name in names:
         if name.endswith(".ktx2"):
             assert validate((tmp_path / name).read_bytes()) == [], name
-    assert set(manifest.textures) == {name for name in names if name.endswith(".ktx2")}
+    assert set(manifest.textures) == {name for name in names if name.endswith(".ktx2") or name == "environment.exr"}
 
 
 def test_the_manifest_says_what_was_baked_and_how_well(make_sample, tmp_path: Path) -> None:
@@ -85,7 +86,7 @@ def test_without_environment_the_manifest_says_what_is_left_out(make_sample, tmp
     manifest = Manifest.model_validate_json((tmp_path / "manifest.json").read_bytes())
     assert manifest.metrics.visibility is None
     reason = "the scene has no environment"
-    assert manifest.left_out == dict.fromkeys(("visibility", "environment_ggx.ktx2", "environment_u.ktx2"), reason)
+    assert manifest.left_out == dict.fromkeys(("visibility", *ENVIRONMENT), reason)
 
 
 @pytest.mark.parametrize("function", list(Function))
@@ -137,6 +138,9 @@ def test_environment_textures_read_back(make_sample, tmp_path: Path) -> None:
     layers = ktx2.read(tmp_path / "environment_u.ktx2")
     assert layers.metadata["lightkiln.alphas"] == "0.04 0.25 1"
     np.testing.assert_array_equal(layers.levels[0][:, 0, ..., :3], given.environment.u_layers.astype(np.float16))
+    picture = oiio.ImageBuf(str(tmp_path / "environment.exr"))
+    assert picture.spec().format == oiio.HALF
+    np.testing.assert_array_equal(picture.get_pixels(oiio.FLOAT), given.environment.panorama.astype(np.float16))
 
 
 def test_the_same_input_gives_the_same_bytes(make_sample, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from kiln_workers.render import environment as products
 from kiln_workers.render.mitsuba_scene import to_mitsuba
 from kiln_workers.render.tile import TexelBatch, TileRenderer
+from kiln_workers.scene.environment import row_solid_angles
 from kiln_workers.scene.model import Environment, Material, Mesh, Scene
 from kiln_workers.sphere import ggx, octahedral
 from kiln_workers.sphere.quadrature import fibonacci_sphere
@@ -116,6 +117,24 @@ def test_cube_mips(sky: Environment) -> None:
 def test_cube_in_a_white_furnace() -> None:
     for level in products.ggx_prefilter(Environment(np.full((8, 16, 3), 0.7, np.float32)), 16, 5, "cpu"):
         np.testing.assert_allclose(level, 0.7, rtol=3e-4)
+
+
+@pytest.mark.parametrize("rotation", [0.0, 90.0, -35.0])
+def test_the_panorama_looks_where_it_says(rotation: float) -> None:
+    """Row 0 is +Y, the centre +X and to the right of it +Z: three.js' `equirectUv`, upside down."""
+    pixels = np.random.default_rng(5).random((8, 16, 3)).astype(np.float32)
+    environment = Environment(pixels, scale=2.0, rotation_deg=rotation)
+    theta = np.pi * (np.arange(8)[:, None] + 0.5) / 8
+    along = 2.0 * np.pi * ((np.arange(16) + 0.5) / 16 - 0.5)
+    directions = np.stack(
+        np.broadcast_arrays(np.sin(theta) * np.cos(along), np.cos(theta), np.sin(theta) * np.sin(along)), axis=-1
+    )
+    expected = products.look_up(environment, directions)
+    np.testing.assert_allclose(products.panorama(environment, 16), expected, rtol=1e-5)
+    smaller = products.panorama(environment, 8)
+    assert smaller.shape == (4, 8, 3)
+    energies = [(row_solid_angles(len(image)) * image.mean(axis=(1, 2))).sum() for image in (expected, smaller)]
+    assert energies[0] == pytest.approx(energies[1], rel=1e-5)
 
 
 def test_irradiance_in_a_white_furnace(

@@ -1,6 +1,7 @@
 """Debian's chromium on software GL, with `lightkiln view` as the server; every page is watched for faults."""
 
 import base64
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -19,6 +20,7 @@ from kiln_schemas.camera import Camera
 
 SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 LIGHTKILN = Path(sys.executable).parent / "lightkiln"
+NODE = Path(__file__).parent / "node"
 
 
 @pytest.fixture(scope="module")  # while playwright runs, nothing else in this process may run an event loop
@@ -27,6 +29,17 @@ def browser() -> Iterator[Browser]:
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox", *SOFTWARE_GL])
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="session")
+def node_modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What package.json pins, from npm."""
+    folder = tmp_path_factory.mktemp("node")
+    shutil.copy(NODE / "package.json", folder)
+    command = ["npm", "install", "--no-audit", "--no-fund", "--no-package-lock", "--ignore-scripts"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, f"npm could not install what package.json pins:\n{done.stderr}"
+    return folder / "node_modules"
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from kiln_schemas.tasks import FitMetrics
 from kiln_workers.package import exr, ktx2, shaders
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.package.half import lobes_to_layers, to_half
-from kiln_workers.render.environment import environment_u, ggx_prefilter
+from kiln_workers.render.environment import environment_u, ggx_prefilter, panorama
 from kiln_workers.scene.examples import courtyard_scene, gallery_scene
 from kiln_workers.scene.model import Environment, Image, Material, Mesh, Scene, TextureRef
 
@@ -55,6 +55,7 @@ def write_package(
         write(conventions.ENVIRONMENT_U_KTX2, ktx2.texture_array(opaque(u), {}), **about)
         mips = [opaque(mip) for mip in ggx_prefilter(scene.environment, 32, 4, "cpu")]
         write(conventions.ENVIRONMENT_GGX_KTX2, ktx2.texture_cube(mips, {}))
+        exr.write_rgb(folder / conventions.ENVIRONMENT_EXR, opaque(panorama(scene.environment, 256))[..., :3])
     (folder / conventions.MANIFEST_JSON).write_text(_manifest(textures).model_dump_json())
     return folder
 

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from kiln_schemas import __version__
 from kiln_schemas.conventions import (
+    ENVIRONMENT_EXR,
     ENVIRONMENT_GGX_KTX2,
     ENVIRONMENT_U_KTX2,
     ERRORS_KTX2,
@@ -68,8 +69,10 @@ class LobeMap:
 
 @dataclass(frozen=True)
 class EnvironmentTextures:
-    """The preconvolved environment (`kiln_workers.render.environment`)."""
+    """The environment, preconvolved and as it is (`kiln_workers.render.environment`)."""
 
+    panorama: Float32
+    """[H, W, 3] equirectangular, W = 2 H: row 0 is +Y, the centre is +X, to the right of it lies +Z."""
     ggx_mips: Sequence[Float32]
     """Per mip [6, S, S, 3], largest first, faces +X -X +Y -Y +Z -Z with OpenGL's face orientations."""
     u_layers: Float32
@@ -259,6 +262,26 @@ def _write_environment(package: _Package, environment: EnvironmentTextures) -> N
     }
     layers = package.half(environment.u_layers)
     package.add_texture(ENVIRONMENT_U_KTX2, ktx2.texture_array(layers, metadata), description)
+    _write_panorama(package, environment.panorama)
+
+
+def _write_panorama(package: _Package, panorama: Float32) -> None:
+    """The environment for other programs, turned as three.js and Blender look up equirectangular images."""
+    pixels, clamped = to_half(panorama)
+    package.clamped += clamped
+    about = "environment, radiance, linear Rec.709; row 0 is +Y, the centre +X, to the right of it +Z"
+    exr.write_rgb(package.folder / ENVIRONMENT_EXR, pixels, comments=about)
+    package.textures[ENVIRONMENT_EXR] = {
+        "width": panorama.shape[1],
+        "height": panorama.shape[0],
+        "format": "half",
+        "channels": ["r", "g", "b"],
+        "projection": "equirectangular",
+        "top": "+Y",
+        "centre": "+X",
+        "right_of_centre": "+Z",
+    }
+    package.add(ENVIRONMENT_EXR)
 
 
 def _manifest(package: _Package) -> Manifest:
@@ -298,7 +321,7 @@ def _left_out(given: PackageInput) -> dict[str, str]:
         if function not in given.lobes:
             out.setdefault(str(function), reason)
     if given.environment is None:
-        for name in (ENVIRONMENT_GGX_KTX2, ENVIRONMENT_U_KTX2):
+        for name in (ENVIRONMENT_GGX_KTX2, ENVIRONMENT_U_KTX2, ENVIRONMENT_EXR):
             out.setdefault(name, reason)
     return out
 

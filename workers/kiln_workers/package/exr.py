@@ -1,7 +1,7 @@
-"""OpenEXR output of linear Rec.709 maps (the irradiance light map), written through OpenEXR's own library.
+"""OpenEXR output of linear Rec.709 pictures (irradiance, environment), written through OpenEXR's own library.
 
 The file carries the chromaticities of Rec.709 (ITU-R BT.709: its primaries and D65) because EXR leaves colour spaces to
-this attribute; channels are 32-bit floats, zip compressed. The library writes only to paths, so the
+this attribute; channels are floats or halves as given, zip compressed. The library writes only to paths, so the
 picture goes to a temporary file whose bytes then take the atomic way of every other file of a package.
 """
 
@@ -18,12 +18,13 @@ from kiln_schemas.errors import InternalError
 from kiln_workers.package.files import write_bytes
 
 Float32 = npt.NDArray[np.float32]
+Half = npt.NDArray[np.float16]
 
 REC709_CHROMATICITIES: Final = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 
-def write_rgb(path: Path, pixels: Float32, *, comments: str = "") -> None:
-    """Write linear Rec.709 pixels [H, W, 3] as a float32 EXR, row 0 at the top; InternalError unless all are finite."""
+def write_rgb(path: Path, pixels: Float32 | Half, *, comments: str = "") -> None:
+    """Write linear Rec.709 pixels [H, W, 3] as an EXR, row 0 at the top; InternalError unless all are finite."""
     if not np.isfinite(pixels).all():
         raise InternalError("the picture holds values that are not finite", where=path.name)
     header = {
@@ -33,7 +34,7 @@ def write_rgb(path: Path, pixels: Float32, *, comments: str = "") -> None:
         "software": f"lightkiln {__version__}",
         "comments": comments,
     }
-    channels = {"RGB": np.ascontiguousarray(pixels, dtype=np.float32)}
+    channels = {"RGB": np.ascontiguousarray(pixels)}
     with tempfile.TemporaryDirectory(prefix="lightkiln-exr-") as folder:
         temporary = Path(folder) / "picture.exr"
         with OpenEXR.File(header, channels) as file:

@@ -1,7 +1,7 @@
-"""The environment without the scene: quadrature samples, U(w, alpha), and the GGX-prefiltered cube.
+"""The environment without the scene: quadrature samples, U(w, alpha), the GGX-prefiltered cube, and its panorama.
 
 Every pixel of the image contributes, weighted with its exact solid angle, so a sun of one pixel is never missed. Both
-products are sums over an octahedral grid of the environment's energy, finer for narrower lobes (see `lobes`).
+filtered products are sums over an octahedral grid of the environment's energy, finer for narrower lobes (see `lobes`).
 """
 
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from kiln_workers.render import lobes
 from kiln_workers.render.backend import Device, select_variant
 from kiln_workers.render.jit import dr, mi
+from kiln_workers.scene.environment import averaged_down
 from kiln_workers.scene.model import Environment, Float32
 from kiln_workers.sphere import octahedral
 
@@ -144,6 +145,22 @@ def look_up(environment: Environment, directions: Floats) -> Floats:
     upper = pixels[above, left % width] * (1.0 - right) + pixels[above, (left + 1) % width] * right
     lower = pixels[below, left % width] * (1.0 - right) + pixels[below, (left + 1) % width] * right
     return np.asarray((upper * (1.0 - down) + lower * down) * environment.scale, dtype=np.float64)
+
+
+def panorama(environment: Environment, widest: int) -> Float32:
+    """The scaled environment [H, W, 3] as three.js and Blender look it up, averaged down to `widest` columns.
+
+    Row 0 is +Y, the centre is +X; to the right of it lies +Z, to the left -Z, both ends are -X.
+    """
+    pixels = environment.pixels
+    if pixels.shape[1] > widest:
+        pixels = averaged_down(pixels, widest)
+    # The model's centre column is +Z with -X to its right: a quarter turn, and the environment's own rotation.
+    shift = pixels.shape[1] * (environment.rotation_deg / 360.0 - 0.25)
+    whole = int(np.floor(shift))
+    near = np.roll(pixels.astype(np.float64), -whole, axis=1)
+    turned = near + (shift - whole) * (np.roll(near, -1, axis=1) - near)
+    return np.asarray(turned * environment.scale, dtype=np.float32)
 
 
 def _cube_mirror(environment: Environment, side: int) -> Float32:

@@ -20,7 +20,7 @@ from kiln_workers.fit.source import valid_texels
 from kiln_workers.package.build import EnvironmentTextures, LobeMap, PackageInput, build_package
 from kiln_workers.package.half import as_stored
 from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelPreview, choose_texels
-from kiln_workers.render.environment import environment_u, ggx_prefilter
+from kiln_workers.render.environment import environment_u, ggx_prefilter, panorama
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import unpack_scene
 from kiln_workers.scene.model import Environment
@@ -42,6 +42,10 @@ U_ROUGHNESS: Final = np.linspace(0.1, 1.0, 10)
 
 LEAST_MIP: Final = 4
 """Side of the GGX cube's smallest mip."""
+
+PANORAMA_SIDES: Final = 8
+"""Columns of environment.exr, at most, in sides of the GGX cube's largest mip: twice what goes around the cube, because
+engines show it behind the scene."""
 
 TEXELS_AT_ONCE: Final = 256
 
@@ -181,12 +185,13 @@ def _preview(texels: _Texels, lobes: Float32, errors: Float32, at: tuple[int, in
 
 
 def _convolve(environment: Environment, settings: PackageSettings) -> EnvironmentTextures:
-    """The environment's two preconvolved textures (light-field paper, eq. 6, and the split sum)."""
+    """The environment's two preconvolved textures (light-field paper, eq. 6, and the split sum), and itself."""
     size = settings.environment_size
     mips = int(np.log2(size / LEAST_MIP)) + 1
     alphas = U_ROUGHNESS**2
     layers, integrals = environment_u(environment, alphas, size)
     return EnvironmentTextures(
+        panorama=panorama(environment, PANORAMA_SIDES * size),
         ggx_mips=ggx_prefilter(environment, size, mips),
         u_layers=layers,
         u_alphas=alphas.tolist(),
