@@ -12,7 +12,8 @@ from kiln_schemas.operators import Scope
 from kiln_schemas.states import TaskState
 from kiln_service import views
 from kiln_service.api.common import Parts, PartsHere, caller
-from kiln_service.dashboard.light_fields import LightFields, TexelMapReader, read_lobes
+from kiln_service.dashboard.light_fields import LightFields, TexelMapReader
+from kiln_service.dashboard.lobes import read_lobes
 from kiln_service.dashboard.pages import see
 from kiln_service.db import JobRow
 
@@ -88,9 +89,13 @@ async def texel(job_id: str, row: Coordinate, column: Coordinate, parts: PartsHe
         told["missing"]["image"] = error.problem().sentence()
     try:
         found = await views.artifact(parts.database, job_id, LIGHT_FIELD_KTX2)
-        told["lobes"] = await read_lobes(parts.blobs, found.sha256, row, column)
     except NotFound:
         told["missing"]["lobes"] = "The lobes can be shown once the package is there."
+        return JSONResponse(told)
+    try:
+        told["lobes"] = await read_lobes(parts.blobs, found.sha256, row, column)
+    except KilnError as error:
+        told["missing"]["lobes"] = error.problem().sentence()
     return JSONResponse(told)
 
 

@@ -1,8 +1,8 @@
-"""Single tiles and texels out of a job's light-field store and package, by byte ranges and without a numeric library.
+"""Single tiles and texels out of a job's light-field store and texel map, by byte ranges and without a numeric library.
 
 The layouts are those of `kiln_workers.store.layout` (Zarr v3: the irradiance has one uncompressed chunk a tile; a
-light-field shard is a tile, its chunks are texels, its index lies at the end), `kiln_workers.scene.container` (texel
-map) and KTX2 (lobes). What Zarr does not store is zero.
+light-field shard is a tile, its chunks are texels, its index lies at the end) and `kiln_workers.scene.container` (texel
+map). What Zarr does not store is zero.
 """
 
 import asyncio
@@ -15,7 +15,7 @@ import obstore
 from obstore.exceptions import BaseError
 from obstore.store import ObjectStore
 
-from kiln_schemas.conventions import ARRAY_IRRADIANCE, ARRAY_LIGHT_FIELD, LAYERS_PER_LOBE, LIGHT_FIELD_KTX2
+from kiln_schemas.conventions import ARRAY_IRRADIANCE, ARRAY_LIGHT_FIELD
 from kiln_schemas.errors import InputError, NotFound
 from kiln_schemas.settings import BakeSettings
 from kiln_service.blobs import Blobs, open_objects
@@ -27,10 +27,6 @@ AT_ONCE: Final = 16
 """Objects read at the same time."""
 HEADER_BYTES: Final = 4096
 """Of a texel map; more than its header has."""
-MOST_LAYERS: Final = 128
-KTX2_IDENTIFIER: Final = b"\xabKTX 20\xbb\r\n\x1a\n"
-KTX2_HEAD: Final = struct.Struct("<12s9I4I2Q3Q")
-"""Identifier, format to supercompression, index, and the first level's place (KTX 2.0, 3)."""
 
 
 class LightFields:
@@ -111,24 +107,6 @@ class LightFields:
             return bytes(await found.bytes_async())
         except FileNotFoundError:
             return None
-
-
-async def read_lobes(blobs: Blobs, sha256: str, row: int, column: int) -> list[tuple[float, ...]]:
-    """Lobes of a texel of `lightfield.ktx2`, seven numbers each; InputError where it is supercompressed."""
-    head = await _bytes(blobs, sha256, 0, KTX2_HEAD.size)
-    if len(head) < KTX2_HEAD.size or not head.startswith(KTX2_IDENTIFIER):
-        raise InputError("it is no KTX2 file", where=LIGHT_FIELD_KTX2)
-    _, _, _, width, height, _, layers, _, _, scheme, *_, offset, _, _ = KTX2_HEAD.unpack(head)
-    if scheme != 0:
-        raise InputError("the lobes are compressed", where=LIGHT_FIELD_KTX2, remedy="Download the package.")
-    if row >= height or column >= width or layers > MOST_LAYERS or layers % LAYERS_PER_LOBE:
-        raise InputError(f"{layers} layers of {width} x {height} texels are no lobes", where=LIGHT_FIELD_KTX2)
-    places = [offset + 8 * ((layer * height + row) * width + column) for layer in range(layers)]
-    if places and places[-1] + 8 > await blobs.size(sha256):
-        raise InputError("the file ends before its lobes do", where=LIGHT_FIELD_KTX2)
-    texels = [struct.unpack("<4e", part) for part in await blobs.read_parts(sha256, places, 8)]
-    pairs = zip(texels[::LAYERS_PER_LOBE], texels[1::LAYERS_PER_LOBE], strict=True)
-    return [(*axis, *amplitude[:3]) for axis, amplitude in pairs]
 
 
 class TexelMapReader:

@@ -133,7 +133,7 @@ class KnownBake:
     def artifacts(self, folder: Path) -> list[dict[str, Any]]:
         """The package's files that the page reads."""
         layers, _ = lobes_to_layers(self.lobes)
-        ktx2.write(folder / "lightfield.ktx2", ktx2.texture_array(layers, {}))
+        ktx2.write(folder / "lightfield.ktx2", ktx2.texture_array(layers, {}), supercompress=True)
         told = np.zeros((32, 32, 4), np.float16)
         told[..., 0], told[..., 3] = self.errors, self.state
         ktx2.write(folder / "errors.ktx2", ktx2.texture_2d(told, {}))

@@ -3,12 +3,15 @@
 import base64
 import json
 import shutil
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 
 from kiln_workers.package import ktx2
+from kiln_workers.package.half import lobes_to_layers
 
 
 def test_tiles_are_told_with_their_states(home, job, rendered):
@@ -46,23 +49,44 @@ def test_a_texel_is_told_as_it_lies_in_the_store(home, job, rendered):
 
 
 def test_lobes_are_read_from_the_package(home, job, rendered, tmp_path):
-    folder = tmp_path / "package"
-    folder.mkdir()
-    lobes = next(file for file in rendered.artifacts(folder) if file["name"] == "lightfield.ktx2")
-    home.sql("INSERT INTO artifacts VALUES (%s, 'lightfield.ktx2', %s, 1, 'image/ktx2')", job, lobes["sha256"])
-    told = home.client.get(f"/jobs/{job}/texels/31/30").json()
-    np.testing.assert_array_equal(np.float32(told["lobes"]), rendered.lobes[31, 30])
-    texture = ktx2.texture_array(np.zeros((2, 32, 32, 4), np.float16), {})
-    ktx2.write(tmp_path / "small.ktx2", texture, supercompress=True)
-    head = (folder / "lightfield.ktx2").read_bytes()[:104]
+    layers, _ = lobes_to_layers(rendered.lobes)
+    home.sql("INSERT INTO artifacts VALUES (%s, 'lightfield.ktx2', %s, 1, 'image/ktx2')", job, home.upload(b"nothing"))
+    for supercompress in (False, True):
+        data = ktx2.encode(ktx2.texture_array(layers, {}), supercompress=supercompress)
+        home.sql("UPDATE artifacts SET sha256 = %s", home.upload(data))
+        for row, column in ((0, 0), (17, 3), (31, 31)):
+            told = home.client.get(f"/jobs/{job}/texels/{row}/{column}").raise_for_status().json()
+            np.testing.assert_array_equal(np.float32(told["lobes"]), rendered.lobes[row, column])
+
+
+def test_lobes_that_cannot_be_read_are_a_sentence(home, job, rendered):
+    home.sql("INSERT INTO artifacts VALUES (%s, 'lightfield.ktx2', %s, 1, 'image/ktx2')", job, home.upload(b"nothing"))
+    texture = ktx2.texture_array(lobes_to_layers(rendered.lobes)[0], {})
+    plain, packed = ktx2.encode(texture), ktx2.encode(texture, supercompress=True)
+    offset, length, size = struct.unpack_from("<3Q", packed, 80)
+
+    def repacked(stream: bytes, width: int = 32) -> bytes:
+        """The compressed file with other bytes as its level."""
+        head = bytearray(packed[:offset])
+        struct.pack_into("<I", head, 20, width)
+        struct.pack_into("<2Q", head, 88, len(stream), size * width // 32)
+        return bytes(head) + stream
+
+    too_far = zstandard.ZstdCompressionParameters.from_level(3, window_log=27)
+    compressor = zstandard.ZstdCompressor(compression_params=too_far).compressobj()  # of a size that it does not know
     for data, sentence in (
-        ((tmp_path / "small.ktx2").read_bytes(), "the lobes are compressed"),
         (b"not a texture", "is no KTX2 file"),
-        (head + bytes(1000), "ends before its lobes"),
+        (plain[:104] + bytes(1000), "ends before its lobes"),
+        (packed[:-1], "ends before its lobes"),
+        (repacked(packed[offset : offset + length // 2]), "ends before its lobes"),
+        (repacked(b"no frame of Zstandard"), "cannot be inflated"),
+        (repacked(compressor.compress(bytes(size)) + compressor.flush()), "cannot be inflated"),
+        (repacked(zstandard.compress(b""), width=2**20), "4.0 GiB are too much"),
     ):
         home.sql("UPDATE artifacts SET sha256 = %s", home.upload(data))
-        reply = home.client.get(f"/jobs/{job}/texels/1/1")
-        assert reply.status_code == 422 and sentence in reply.json()["detail"], reply.text
+        told = home.client.get(f"/jobs/{job}/texels/1/1").raise_for_status().json()
+        assert "lobes" not in told and sentence in told["missing"]["lobes"], told["missing"]
+        assert base64.b64decode(told["image"])
 
 
 def test_a_store_that_is_gone_is_a_sentence(home, job, rendered):
