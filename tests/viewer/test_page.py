@@ -89,6 +89,23 @@ def test_a_zstd_package_draws_the_same(serve, viewer, capture, tmp_path) -> None
     np.testing.assert_array_equal(*pictures)
 
 
+def test_compressed_textures_that_arrive_together_are_all_decoded(serve, viewer, tmp_path) -> None:
+    """The decoder of Zstandard is loaded once, and those that come meanwhile wait for it."""
+    folder = packages.write_package(tmp_path / "package", packages.cabinet_scene(), supercompress=True)
+    with serve(folder) as url:
+        page = viewer.open(url, viewport=SMALL)
+        told = page.evaluate(
+            """() => new Promise((done) => {
+                const worker = new Worker("/static/viewer/page/decode.js", { type: "module" });
+                const told = [];
+                worker.onmessage = ({ data }) => told.push(data.error ?? data.texture.layers) === 6 && done(told);
+                const { href: url } = new URL("/package/lightfield.ktx2", location);
+                for (let name = 0; name < 6; name += 1) worker.postMessage({ name, url });
+            })"""
+        )
+    assert told == [16] * 6
+
+
 @pytest.mark.parametrize(
     ("fault", "sentence"),
     [("webgl", "has no WebGL2"), ("version", "format version 99"), ("texture", "lightfield.ktx2 cannot be read")],

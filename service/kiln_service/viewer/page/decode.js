@@ -36,15 +36,18 @@ async function decode(bytes) {
   return { width, height, layers, faces, levels };
 }
 
-let zstd = null;
+let zstd = null; // a promise, so that textures that arrive together wait for the same decoder
 
 async function inflate(scheme, level, size) {
   if (scheme === KHR_SUPERCOMPRESSION_NONE) return level.levelData;
   if (scheme !== KHR_SUPERCOMPRESSION_ZSTD) throw new Error(`its supercompression scheme is ${scheme}`);
-  if (zstd === null) {
-    const { ZSTDDecoder } = await import("../vendor/zstddec/zstddec.js");
-    zstd = new ZSTDDecoder();
-    await zstd.init();
-  }
-  return zstd.decode(level.levelData, size);
+  zstd ??= loadZstd();
+  return (await zstd).decode(level.levelData, size);
+}
+
+async function loadZstd() {
+  const { ZSTDDecoder } = await import("../vendor/zstddec/zstddec.js");
+  const decoder = new ZSTDDecoder();
+  await decoder.init();
+  return decoder;
 }
