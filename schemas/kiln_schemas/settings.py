@@ -102,7 +102,7 @@ class PackageSettings(Contract):
         le=1024,
         description="side of the GGX cube's largest mip; environment.exr is 8 times as wide at most",
     )
-    supercompress: bool = Field(default=False, description="Zstandard inside the lobe textures")
+    supercompress: bool = Field(default=True, description="Zstandard inside the lobe textures")
 
 
 class BakeSettings(Contract):

@@ -1,7 +1,7 @@
 """Recomputes a package's errors from its KTX2 file and the light-field store, sharing no code with lightkiln.
 
-Only numpy and zarr-python: an own KTX2 parser, an own octahedral map, solid angles by summing the area element over
-sub-pixels. Run it as a program (`python recompute.py PACKAGE STORE light_field`) or call `recompute`.
+Only numpy, zarr-python and its numcodecs: an own KTX2 parser, an own octahedral map, solid angles by summing the area
+element over sub-pixels. Run it as a program (`python recompute.py PACKAGE STORE light_field`) or call `recompute`.
 """
 
 import json
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import zarr
+from numcodecs.zstd import Zstd
 
 SUB_PIXELS = 32
 FILES = {"light_field": "lightfield.ktx2", "visibility": "visibility.ktx2"}
@@ -41,12 +42,13 @@ def recompute(package_dir: Path, store_path: Path, function: str) -> tuple[float
 
 
 def read_half_layers(data: bytes) -> np.ndarray:
-    """Layers [L, H, W, 4] of an RGBA16F KTX2 array texture without mips and without supercompression, as float64."""
+    """Layers [L, H, W, 4] of an RGBA16F KTX2 array texture without mips, plain or with Zstandard, as float64."""
     assert data[:12] == b"\xabKTX 20\xbb\r\n\x1a\n", "not a KTX2 file"
     vk_format, _, width, height, depth, layers, faces, levels, scheme = struct.unpack_from("<9I", data, 12)
-    assert (vk_format, depth, faces, levels, scheme) == (97, 0, 1, 1, 0), "not a plain RGBA16F array"
+    assert (vk_format, depth, faces, levels) == (97, 0, 1, 1) and scheme in (0, 2), "not an RGBA16F array"
     offset, length, _ = struct.unpack_from("<3Q", data, 80)
-    halves = np.frombuffer(data[offset : offset + length], "<f2").reshape(layers, height, width, 4)
+    level = data[offset : offset + length]
+    halves = np.frombuffer(Zstd().decode(level) if scheme == 2 else level, "<f2").reshape(layers, height, width, 4)
     return halves.astype(np.float64)
 
 

@@ -50,7 +50,7 @@ GATES = Gates(log_mse_rel=1e-6, visibility_log_mse_rel=0.5, flip={"front": 0.6})
 @pytest.fixture(scope="module")
 def baked(tmp_path_factory: pytest.TempPathFactory) -> Baked:
     scene = replace(room(), environment=Environment(sky()))
-    settings = make_settings("draft", [*TINY, "package.supercompress=true"])
+    settings = make_settings("draft", TINY)
     return bake(tmp_path_factory.mktemp("stages"), scene, settings, gates=GATES, cameras={"front": FRONT})
 
 
