@@ -141,6 +141,50 @@ def cabinet_scene() -> Scene:
     return Scene(meshes, materials, images, environment=Environment(pixels, 1.0, 70.0))
 
 
+def room_scene() -> Scene:
+    """A closed room of 4 x 2.5 x 6 m with a solid block in its middle; its walls are seen from inside only."""
+    walls = (
+        ("floor", (0, 0, 6), (4, 0, 0), (0, 0, -6)),
+        ("ceiling", (0, 2.5, 0), (4, 0, 0), (0, 0, 6)),
+        ("back", (0, 0, 0), (4, 0, 0), (0, 2.5, 0)),
+        ("front", (4, 0, 6), (-4, 0, 0), (0, 2.5, 0)),
+        ("left", (0, 0, 6), (0, 0, -6), (0, 2.5, 0)),
+        ("right", (4, 0, 0), (0, 0, 6), (0, 2.5, 0)),
+    )
+    return Scene(_placed((*walls, *block((1.6, 0, 2.6), (0.8, 1.2, 0.8)))), _three_materials())
+
+
+def block_scene() -> Scene:
+    """A solid block and nothing else."""
+    return Scene(_placed(block((-1, 3, 5), (2, 1, 1))), _three_materials())
+
+
+def block(corner, size) -> tuple[tuple[str, tuple, tuple, tuple], ...]:
+    """The six sides of a solid block, each as name, corner, u and v."""
+    (x, y, z), (w, h, d) = corner, size
+    return (
+        ("block front", (x, y, z + d), (w, 0, 0), (0, h, 0)),
+        ("block back", (x + w, y, z), (-w, 0, 0), (0, h, 0)),
+        ("block right", (x + w, y, z + d), (0, 0, -d), (0, h, 0)),
+        ("block left", (x, y, z), (0, 0, d), (0, h, 0)),
+        ("block top", (x, y + h, z + d), (w, 0, 0), (0, 0, -d)),
+        ("block bottom", (x, y, z), (w, 0, 0), (0, 0, d)),
+    )
+
+
+def _placed(quads) -> tuple[Mesh, ...]:
+    """Quads with a cell of the light map each."""
+    return tuple(
+        _quad(name, k % 3, corner, u, v, (0.02 + 0.25 * (k % 4), 0.02 + 0.33 * (k // 4), 0.2))
+        for k, (name, corner, u, v) in enumerate(quads)
+    )
+
+
+def _three_materials() -> tuple[Material, ...]:
+    colours = ((0.8, 0.75, 0.7), (0.5, 0.6, 0.8), (0.7, 0.4, 0.3))
+    return tuple(Material(f"paint {k}", base_color=(*colour, 1.0), roughness=0.6) for k, colour in enumerate(colours))
+
+
 def _quad(name: str, material: int, corner, u, v, cell) -> Mesh:
     """A quad corner, corner + u, corner + u + v, corner + v, seen from the side of u x v; `cell` is (u, v, side)."""
     corner, u, v = (np.asarray(x, np.float64) for x in (corner, u, v))

@@ -9,19 +9,14 @@ const STEP = 0.02; // of the scene's size a key press
 const MOVES = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] };
 const TURNS = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
-// From `#camera=px,py,pz:tx,ty,tz:fov`, as `lightkiln shade` takes it; else from inside the scene's box along -Z.
-export function startCamera(bounds, hash) {
+// From `#camera=px,py,pz:tx,ty,tz:fov`, as `lightkiln shade` takes it; null where there is none.
+export function readCamera(hash) {
   const number = "(-?[0-9.]+)";
   const point = `${number},${number},${number}`;
   const found = new RegExp(`^#camera=${point}:${point}:${number}$`).exec(decodeURIComponent(hash));
-  if (found !== null) {
-    const [px, py, pz, tx, ty, tz, fov] = found.slice(1).map(Number);
-    return { position: [px, py, pz], target: [tx, ty, tz], fov_deg: fov };
-  }
-  const centre = bounds.getCenter(new THREE.Vector3());
-  const size = bounds.getSize(new THREE.Vector3());
-  const eye = centre.clone().add(new THREE.Vector3(0.05 * size.x, 0.1 * size.y, 0.48 * size.z));
-  return { position: eye.toArray(), target: centre.toArray(), fov_deg: 55 };
+  if (found === null) return null;
+  const [px, py, pz, tx, ty, tz, fov] = found.slice(1).map(Number);
+  return { position: [px, py, pz], target: [tx, ty, tz], fov_deg: fov };
 }
 
 export class Navigation {

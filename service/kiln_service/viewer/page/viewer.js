@@ -1,6 +1,7 @@
 // The page: opens the package, draws it when something has changed, and obeys its controls.
 
-import { Navigation, startCamera } from "./navigation.js";
+import { firstCamera } from "./first_camera.js";
+import { Navigation, readCamera } from "./navigation.js";
 import { PackageError, openPackage } from "./package.js";
 import { Picture } from "./picture.js";
 import { Reference } from "./reference.js";
@@ -19,7 +20,9 @@ export async function start() {
   });
   performance.mark("package read");
   const picture = new Picture(canvas, opened);
-  picture.setCamera(startCamera(picture.bounds, location.hash));
+  const [stated] = Object.values(opened.manifest.views ?? {});
+  const first = () => firstCamera(opened.meshes, picture.bounds, canvas.clientWidth / Math.max(canvas.clientHeight, 1));
+  picture.setCamera(readCamera(location.hash) ?? stated?.camera ?? first());
   form.hidden = false;
   offerControls(picture);
   const reference = new Reference(picture, form);
