@@ -127,6 +127,39 @@ def test_what_cannot_work_is_said(fault, sentence, serve, viewer, tmp_path) -> N
         assert sentence in page.inner_text("#status")
 
 
+def test_a_package_with_older_shaders_says_which_switches_it_lacks(serve, viewer, capture, tmp_path) -> None:
+    """Those controls are off, and the picture is the same as with newer shaders and all terms."""
+    pictures, camera = [], packages.camera("cabinet")
+    for name in ("new", "old"):
+        folder = packages.write_package(tmp_path / name, packages.cabinet_scene())
+        shader = folder / "shaders" / "surface.frag.glsl"
+        text = shader.read_text()
+        if name == "old":
+            for declared, constant in (
+                ("uniform vec4 uTerms;", "const vec4 uTerms = vec4(1.0);"),
+                ("uniform bool uOcclusion;", "const bool uOcclusion = true;"),
+                ("uniform float uRoughnessBias;", "const float uRoughnessBias = 0.0;"),
+            ):
+                assert declared in text
+                text = text.replace(declared, constant)
+        shader.write_text(text)
+        with serve(folder) as url:
+            page = viewer.open(url)
+            off = page.eval_on_selector_all("#controls :disabled", "controls => controls.map(({ name }) => name)")
+            note = page.inner_text("#lacking")
+            pictures.append(capture(page, camera, ["emission", "diffuse", "interreflection", "environment"], 48, 27, 1))
+            if name == "old":
+                page.screenshot(path=SCREENSHOTS / "older_shaders.png")
+                assert note.endswith(
+                    "older than this viewer and have no switches for: single terms, visibility, one roughness."
+                )
+                assert off == [*["term"] * 4, "occlusion", "override", "roughness"]
+            else:
+                assert (off, note) == ([], "")
+    assert pictures[0].max() > 0.1
+    np.testing.assert_array_equal(*pictures)
+
+
 def test_phone_and_dark(made, serve, viewer) -> None:
     with serve(made("cabinet")) as url:
         page = viewer.open(url, viewport={"width": 320, "height": 480}, color_scheme="dark")

@@ -6,6 +6,15 @@ import * as THREE from "../vendor/three/three.module.min.js";
 export const INCLUDES = ["sg.glsl", "environment.glsl", "lightkiln.glsl"];
 const MAX_U_LAYERS = 16; // LK_MAX_U_LAYERS
 
+// Uniforms by which the example shader leaves things out or overrides them, and what for; older packages' have not all.
+const SWITCHES = { uTerms: "single terms", uOcclusion: "visibility", uRoughnessBias: "one roughness" };
+
+// Those that a package's shaders lack.
+export function lackingSwitches(shaders) {
+  const has = (name) => new RegExp(`uniform\\s+\\w+\\s+${name}\\b`).test(shaders["surface.frag.glsl"]);
+  return Object.entries(SWITCHES).filter(([name]) => !has(name));
+}
+
 export const PRECISION = `precision highp float;
 precision highp int;
 precision highp sampler2D;

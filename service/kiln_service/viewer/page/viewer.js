@@ -1,6 +1,7 @@
 // The page: opens the package, draws it when something has changed, and obeys its controls.
 
 import { firstCamera } from "./first_camera.js";
+import { lackingSwitches } from "./material.js";
 import { Navigation, readCamera } from "./navigation.js";
 import { PackageError, openPackage } from "./package.js";
 import { Picture } from "./picture.js";
@@ -53,6 +54,14 @@ function offerControls(picture) {
   lobes.max = picture.lobes;
   lobes.value = picture.lobes;
   for (const label of form.querySelectorAll("[data-environment]")) label.hidden = !picture.hasEnvironment;
+  const lacking = lackingSwitches(picture.opened.shaders);
+  if (!lacking.length) return;
+  for (const [name] of lacking) {
+    for (const control of form.querySelectorAll(`[data-switch=${name}]`)) control.disabled = true;
+  }
+  const note = document.getElementById("lacking");
+  note.hidden = false;
+  note.textContent = `The shaders of this package are older than this viewer and have no switches for: ${lacking.map(([, what]) => what).join(", ")}.`;
 }
 
 // What the controls say, put into the picture.
