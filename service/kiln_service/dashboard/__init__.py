@@ -5,24 +5,14 @@
 """
 
 from importlib import resources
-from typing import Any
 
-from fastapi import FastAPI, Response
-from fastapi.staticfiles import StaticFiles
+from fastapi import FastAPI
 
 from kiln_service.dashboard import atlas, job, jobs, sign_in, submit, workers
 from kiln_service.dashboard.pages import error_page
+from kiln_service.static import Files, compressed
 
 __all__ = ["error_page", "install"]
-
-
-class _Files(StaticFiles):
-    """Files that a browser asks about before it uses its copy: a newer lightkiln has others under the same names."""
-
-    def file_response(self, *args: Any, **kwargs: Any) -> Response:
-        response = super().file_response(*args, **kwargs)
-        response.headers["Cache-Control"] = "no-cache"
-        return response
 
 
 def install(app: FastAPI) -> None:
@@ -30,5 +20,5 @@ def install(app: FastAPI) -> None:
     for module in (sign_in, jobs, job, atlas, submit, workers):
         app.include_router(module.router)
     folder = resources.files(__package__)
-    app.mount("/static/vendor", _Files(directory=str(folder / "vendor")), name="vendor")
-    app.mount("/static", _Files(directory=str(folder / "static")), name="static")
+    app.mount("/static/vendor", compressed(Files(directory=str(folder / "vendor"))), name="vendor")
+    app.mount("/static", compressed(Files(directory=str(folder / "static"))), name="static")

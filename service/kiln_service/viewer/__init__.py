@@ -12,11 +12,11 @@ from typing import Any, Final
 
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.responses import HTMLResponse, Response
-from fastapi.staticfiles import StaticFiles
 
 from kiln_schemas.operators import Scope
 from kiln_service import views
 from kiln_service.api.common import PartsHere, caller
+from kiln_service.static import Files, compressed
 
 FOLDER: Final = resources.files(__package__)
 STATIC: Final = "/static/viewer"
@@ -32,8 +32,8 @@ WORKER_POLICY: Final = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'
 router = APIRouter(include_in_schema=False)
 
 
-class Scripts(StaticFiles):
-    """The viewer's files; a browser asks whether its copy is still good."""
+class Scripts(Files):
+    """The viewer's files."""
 
     def __init__(self) -> None:
         super().__init__(directory=str(FOLDER))
@@ -43,8 +43,6 @@ class Scripts(StaticFiles):
         if path.split("/")[0] not in ("page", "vendor"):
             return Response(status_code=404)
         response = await super().get_response(path, scope)
-        response.headers["Cache-Control"] = "no-cache"
-        response.headers["X-Content-Type-Options"] = "nosniff"
         if path == WORKER:
             response.headers["Content-Security-Policy"] = WORKER_POLICY
         return response
@@ -67,4 +65,4 @@ async def view(job_id: str, parts: PartsHere) -> Response:
 def install(app: FastAPI) -> None:
     """Add the page and its scripts; before the dashboard, whose files are mounted above them."""
     app.include_router(router)
-    app.mount(STATIC, Scripts(), name="viewer")
+    app.mount(STATIC, compressed(Scripts()), name="viewer")
