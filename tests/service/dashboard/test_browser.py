@@ -112,6 +112,62 @@ def test_a_scene_is_submitted_by_upload(home, dashboard, tmp_path, screenshot, a
     assert job["labels"] == {"project": "demo", "shot": "12"} and job["submitter"] == "owner"
 
 
+def test_quality_gates_are_stated_and_what_is_wrong_is_said_at_its_field(home, dashboard, tmp_path, screenshot, axe):
+    (tmp_path / "hall.glb").write_bytes(b"glTF")
+    page = dashboard.open("/submit")
+    uploads = []
+    page.on("request", lambda request: uploads.append(request.url) if request.method != "GET" else None)
+    submit = page.get_by_role("button", name="Upload and submit")
+    submit.click()
+    expect(page.locator("#files")).to_have_accessible_description(re.compile("select one or more files"))
+    expect(page.locator("#files")).to_be_focused()
+    page.set_input_files("#files", tmp_path / "hall.glb")
+    page.get_by_text("Quality gates").click()
+    page.get_by_label("Light field, at most").fill("2")
+    page.get_by_role("button", name="Add a camera").click()
+    expect(page.get_by_label("Name").last).to_be_focused()
+    page.get_by_label("Name").last.fill("front")
+    page.get_by_label("Place, target and angle").fill("3,4,9")
+    page.get_by_label("FLIP, at most").fill("0.25")
+    page.get_by_text("Quality gates").click()  # folded again: what is wrong unfolds it
+    submit.click()
+    expect(page.get_by_label("Light field, at most")).to_have_accessible_description(
+        re.compile("less than or equal to 1")
+    )
+    expect(page.get_by_label("Light field, at most")).to_be_focused()
+    expect(page.get_by_label("Place, target and angle")).to_have_accessible_description(
+        re.compile("px,py,pz:tx,ty,tz:fov")
+    )
+    expect(page.locator("#submit [aria-invalid]")).to_have_count(2)
+    assert uploads == []
+    assert axe(page) == []
+    screenshot(page, "submit-gates")
+    # What only the coordinator knows: zero is no threshold, and a camera has to look somewhere.
+    page.get_by_label("Light field, at most").fill("0")
+    page.get_by_label("Place, target and angle").fill("3,4,9:0,1,0:45")
+    submit.click()
+    expect(page.get_by_label("Light field, at most")).to_have_accessible_description(re.compile("greater than 0"))
+    expect(page.locator("#submit [aria-invalid]")).to_have_count(1)
+    page.get_by_label("Light field, at most").fill("0.3")
+    page.get_by_label("Place, target and angle").fill("3,4,9:3,4,9:45")
+    submit.click()
+    expect(page.get_by_label("Place, target and angle")).to_have_accessible_description(re.compile("position coincide"))
+    expect(page.locator("#submit [aria-invalid]")).to_have_count(1)
+    page.get_by_label("Place, target and angle").fill("3,4,9:0,1,0:45")
+    page.get_by_role("button", name="Add a camera").click()
+    for name, value in (("Name", "front"), ("Place, target and angle", "9,4,3:0,1,0:45"), ("FLIP, at most", "0.1")):
+        page.get_by_label(name).last.fill(value)
+    submit.click()
+    expect(page.get_by_label("Name").last).to_have_accessible_description("Another camera has this name.")
+    page.get_by_role("button", name="Remove").last.click()
+    submit.click()
+    expect(page.get_by_role("heading", name="hall")).to_be_visible()
+    job = home.job(page.url.rpartition("/")[2])
+    assert job["gates"] == {"log_mse_rel": 0.3, "visibility_log_mse_rel": None, "flip": {"front": 0.25}}
+    camera = {"position": [3, 4, 9], "target": [0, 1, 0], "fov_deg": 45, "up": [0, 1, 0]}
+    assert job["cameras"] == {"front": camera}
+
+
 def test_progress_comes_by_itself_and_the_reader_keeps_the_place(home, dashboard, known_bake, screenshot):
     job = home.submit(name="live")["id"]
     bake, worker = known_bake(job), home.worker()
