@@ -90,7 +90,7 @@ def test_a_solid_block_is_seen_from_outside_and_above(serve, viewer, tmp_path) -
     assert covered > 0.1 and black < 0.005  # a pixel on an edge
 
 
-def test_a_camera_that_the_package_states_goes_first(serve, viewer, tmp_path) -> None:
+def test_a_stated_camera_goes_first_and_a_very_large_scene_is_not_searched(serve, viewer, tmp_path) -> None:
     folder = packages.write_package(tmp_path / "package", packages.cabinet_scene(), size=8, lobes=2)
     manifest = Manifest.model_validate_json((folder / conventions.MANIFEST_JSON).read_text())
     views = {"front": ReferenceView(camera=packages.camera("cabinet"), white=1.0)}
@@ -100,3 +100,10 @@ def test_a_camera_that_the_package_states_goes_first(serve, viewer, tmp_path) ->
         asked = viewer.open(f"{url}#camera=1,2,3:0,0.5,0:40", viewport={"width": 300, "height": 200})
         for page, position in ((stated, [0.4, 1.6, 4.2]), (asked, [1, 2, 3])):
             assert page.evaluate("viewer.then(({ camera }) => camera.position.toArray())") == pytest.approx(position)
+        camera = asked.evaluate(
+            """async () => {
+                const { firstCamera } = await import("/static/viewer/page/first_camera.js");
+                return firstCamera([{ geometry: { index: { count: 3_000_000 } } }], (await viewer).bounds, 1.5);
+            }"""
+        )
+    assert camera["position"][1] > 1.0 and camera["position"][2] > camera["position"][0] > 0.0

@@ -144,7 +144,7 @@ def test_a_package_with_older_shaders_says_which_switches_it_lacks(serve, viewer
                 text = text.replace(declared, constant)
         shader.write_text(text)
         with serve(folder) as url:
-            page = viewer.open(url)
+            page = viewer.open(url, viewport=SMALL)
             off = page.eval_on_selector_all("#controls :disabled", "controls => controls.map(({ name }) => name)")
             note = page.inner_text("#lacking")
             pictures.append(capture(page, camera, ["emission", "diffuse", "interreflection", "environment"], 48, 27, 1))

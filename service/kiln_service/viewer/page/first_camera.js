@@ -7,6 +7,8 @@
 //    side that shows most fronts of surfaces and fewest backs, which are black. Of sides that are nearly alike the front
 //    is taken (+Z, as glTF has it), a little from the right.
 //
+// Scenes of many triangles, for which this would take seconds, are seen from the front without a look at them.
+//
 // A place is inside where of eight horizontal rays six hit the front of a surface, none hits the back of one (that would be
 // the inside of something solid), and the ray down finds a floor.
 
@@ -14,6 +16,7 @@ import * as THREE from "../vendor/three/three.module.min.js";
 
 const UP = new THREE.Vector3(0, 1, 0);
 const DOWN = new THREE.Vector3(0, -1, 0);
+const MOST_TRIANGLES = 500_000;
 const AROUND = 8;
 const WALLS = 6;
 const WAYS = 16;
@@ -85,6 +88,8 @@ function meetPart({ corners, doubleSided }, { x: ox, y: oy, z: oz }, { x: dx, y:
 }
 
 export function firstCamera(meshes, bounds, aspect) {
+  const triangles = meshes.reduce((sum, { geometry }) => sum + (geometry.index ?? geometry.attributes.position).count / 3, 0);
+  if (triangles > MOST_TRIANGLES) return framing(bounds, SIDES[0], aspect);
   const surfaces = new Surfaces(meshes);
   return inside(surfaces, bounds, aspect) ?? outside(surfaces, bounds, aspect);
 }
