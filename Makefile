@@ -1,7 +1,7 @@
 # make demo   bake a bundled example and say where the results are
 # make test   everything that has to hold
 # make lint   the static part of it
-# make chaos  bakes under 200 faults: killed processes, cut wires, full disks (hours; tests run a few)
+# make chaos  bakes under 200 faults: killed processes, cut wires, full disks (about an hour; tests run a few)
 # make hostile   the long run of schemathesis over the interface
 # make venv   the virtual environment in .venv that these use
 
@@ -40,8 +40,12 @@ node:
 chromium:
 	@deploy/install/chromium.sh
 
+## Tests that kill processes and time what they do run one after the other, all others side by side.
+ALONE := tests/chaos tests/e2e tests/service/test_replicas.py
+
 test: lint node chromium
-	$(BIN)/pytest
+	$(BIN)/pytest $(ALONE)
+	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile $(ALONE:%=--ignore=%)
 
 hostile: venv
 	LIGHTKILN_HOSTILE_EXAMPLES=400 $(BIN)/pytest tests/hostile/test_openapi.py -q -rP
