@@ -57,12 +57,19 @@ def test_same_call_again_has_nothing_to_do(baked: Path, room_files: tuple[Path, 
     assert other.returncode == 4 and json.loads(other.stdout)["code"] == "conflict"
 
 
+def hear_ctrl_c() -> None:
+    """A shell starts what is in the background deaf to SIGINT, and children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_interrupted_bake_resumes_to_the_same_bytes(baked: Path, room_files: tuple[Path, Path], folder: Path) -> None:
     """Ctrl-C while tiles render: exit 130, nothing that looks like a result, then --resume."""
     scene, environment = room_files
     out = folder / "out"
     command = [Path(sys.executable).with_name("lightkiln"), "bake", scene, "--env", environment, "--preset", "draft"]
-    running = subprocess.Popen([*command, *settings(), "--out", out], stderr=subprocess.PIPE, text=True)
+    running = subprocess.Popen(
+        [*command, *settings(), "--out", out], stderr=subprocess.PIPE, text=True, preexec_fn=hear_ctrl_c
+    )
     log = out / ".lightkiln" / "logs" / "worker-1.log"
     store = out / ".lightkiln" / "store"
     wait_until("the first tile is written", lambda: any(store.glob("*.zarr/light_field/c/*/*/*")) and log.exists())
