@@ -31,16 +31,16 @@ async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Payload:
         case TaskKind.PREPARE:
             return PreparePayload(**common, bundle=job.bundle)
         case TaskKind.RENDER:
-            return RenderPayload(**common, **await tx.one("prepared_blobs", job_id=job.id), tile=task.spec["tile"])
+            return RenderPayload(**common, **_prepared_blobs(job), tile=task.spec["tile"])
         case TaskKind.FIT:
             return FitPayload(
                 **common,
                 function=task.spec["function"],
-                texel_map=(await tx.one("prepared_blobs", job_id=job.id))["texel_map"],
+                texel_map=_prepared_blobs(job)["texel_map"],
                 renders=await _renders(tx, job),
             )
         case TaskKind.REFINE:
-            prepared = await tx.one("prepared_blobs", job_id=job.id)
+            prepared = _prepared_blobs(job)
             block = Block.model_validate(task.spec["block"])
             fits = await _fits(tx, job)
             return RefinePayload(
@@ -65,6 +65,13 @@ async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Payload:
                 gates=job.gates,
                 cameras=job.cameras,
             )
+
+
+def _prepared_blobs(job: JobRow) -> dict[str, Any]:
+    """The blobs that the prepare task made, by the names that payloads have for them."""
+    assert job.prepared is not None, "tasks after the prepare task wait for it"
+    made = job.prepared
+    return {"scene": made["scene"], "texel_map": made["texel_map"], "between": made.get("between", ())}
 
 
 async def _prepared(tx: Tx, job: JobRow) -> PrepareResult:

@@ -2,14 +2,14 @@
 
 A task's state is all there is to the queue, so nothing can disagree with it: a claim picks a row, and whoever moves a
 task into a claimable state wakes the claims that wait. What a worker may take depends on its kinds and tags,
-on blocks, and on who else is there (`work.sql`, pick_task).
+on blocks, and on who else is there (the database function `next_task`).
 """
 
 from collections.abc import Collection
-from typing import Final
+from typing import Any, Final
 
 from kiln_schemas.tasks import TaskKind
-from kiln_service.db import TaskRow, Tx, WorkerRow
+from kiln_service.db import Tx, WorkerRow
 from kiln_service.planner import PRIORITY
 
 RANK_STEP: Final = 8
@@ -21,22 +21,16 @@ def rank(priority: int, kind: TaskKind) -> int:
     return priority * RANK_STEP + PRIORITY[kind]
 
 
-async def pick(
-    tx: Tx, worker: WorkerRow, kinds: Collection[TaskKind], stale_s: float, job_id: str | None = None
-) -> TaskRow | None:
-    """The task that this worker gets next, of all jobs or of one; nothing is locked.
+def wanted(worker: WorkerRow, kinds: Collection[TaskKind], stale_s: float) -> dict[str, Any]:
+    """What the database's `next_task` goes by; workers not seen for `stale_s` count as gone."""
+    asked = [kind.value for kind in kinds]
+    return {"worker": worker.name, "tags": list(worker.tags), "kinds": asked, "stale_s": stale_s}
 
-    Workers not seen for `stale_s` count as gone.
-    """
-    row = await tx.maybe(
-        "pick_task",
-        worker=worker.name,
-        tags=list(worker.tags),
-        kinds=[kind.value for kind in kinds],
-        job_id=job_id,
-        stale_s=stale_s,
-    )
-    return None if row is None else TaskRow.of(row)
+
+async def look(tx: Tx, worker: WorkerRow, kinds: Collection[TaskKind], stale_s: float) -> str | None:
+    """The id of the job whose task this worker would get next; nothing is locked."""
+    row = await tx.maybe("pick_task", **wanted(worker, kinds, stale_s))
+    return None if row is None else str(row["job_id"])
 
 
 async def announce(tx: Tx, kinds: Collection[TaskKind]) -> None:

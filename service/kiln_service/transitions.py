@@ -4,7 +4,7 @@ Each function is one move of the tables in `kiln_schemas.states`; an illegal one
 caller has locked the job and, for a move of a task, the task (`Tx`'s order of locks).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -122,17 +122,25 @@ async def release_tasks(tx: Tx, job: JobRow, kind: TaskKind) -> None:
         await add_event(tx, job.id, "tasks.queued", COORDINATOR, detail={"kind": kind.value, "count": len(rows)})
 
 
-async def claim_task(tx: Tx, job: JobRow, task: TaskRow, worker: WorkerRow) -> TaskRow:
-    """queued, soft-failed > active under a new attempt; the job's first claim moves it to active too."""
-    check_task_move(task.state, TaskState.ACTIVE)
-    await _move(tx, "move_task_active", task, worker_id=worker.id)
-    claimed = replace(
-        task, state=TaskState.ACTIVE, attempt=task.attempt + 1, worker_id=worker.id, progress=None, started=None
-    )
+async def claim_next(
+    tx: Tx, job_id: str, worker: WorkerRow, kinds: Collection[TaskKind], stale_s: float
+) -> tuple[JobRow, TaskRow] | None:
+    """queued, soft-failed > active under a new attempt: the task of a job that a worker gets next; it locks the job.
+
+    The job's first claim moves it to active too. None where the job has no task for this worker.
+    """
+    for state in CLAIMABLE_TASK_STATES:
+        check_task_move(state, TaskState.ACTIVE)
+    locked = await tx.ask("lock_job", id=job_id)
+    claimed = await tx.maybe("claim_next", job_id=job_id, worker_id=worker.id, **queue.wanted(worker, kinds, stale_s))
+    row = await locked.fetchone()
+    if claimed is None or row is None:
+        return None
+    job, task = JobRow.of(row), TaskRow.of(claimed)
     if job.state is JobState.QUEUED:
-        await move_job(tx, job, JobState.ACTIVE, COORDINATOR)
-    await _task_event(tx, claimed, "task.claimed", f"worker:{worker.id}", {"worker": worker.name})
-    return claimed
+        job = await move_job(tx, job, JobState.ACTIVE, COORDINATOR)
+    await _task_event(tx, task, "task.claimed", f"worker:{worker.id}", {"worker": worker.name})
+    return job, task
 
 
 async def requeue_task(tx: Tx, task: TaskRow, kind: str, actor: str, *, strike: bool, reason: str) -> None:

@@ -107,36 +107,36 @@ class Work:
             if worker.orders == "drain":
                 raise Drained("an operator told the worker to leave", where=worker.name)
             rests = worker.orders == "sleep" or worker.asleep
-            seen = None if rests else await queue.pick(tx, worker, kinds, stale_s)
-            if seen is None:
+            job_id = None if rests else await queue.look(tx, worker, kinds, stale_s)
+            if job_id is None:
                 await tx.run("see_worker_lightly", id=worker_id)
                 return _NOTHING
-        async with self._database.turn(seen.job_id) as tx:
-            locked = await tx.ask("lock_job", id=seen.job_id)
-            # Others may have claimed it meanwhile: look again, now that nobody else can.
-            task = await queue.pick(tx, worker, kinds, stale_s, seen.job_id)
-            row = await locked.fetchone()
-            if task is None or row is None:
+        async with self._database.turn(job_id) as tx:
+            # Others may have claimed what was seen.
+            claimed = await transitions.claim_next(tx, job_id, worker, kinds, stale_s)
+            if claimed is None:
                 return _GONE
-            job = JobRow.of(row)
-            task = await transitions.claim_task(tx, job, task, worker)
-            payload = await build_payload(tx, job, task)
+            job, task = claimed
             await tx.run("see_worker", id=worker_id)
+            payload = await build_payload(tx, job, task)
         return Claim(task_id=task.id, job_id=job.id, attempt=task.attempt, payload=payload, checkpoint=task.checkpoint)
 
     async def heartbeat(self, worker_id: str, beat: Heartbeat) -> HeartbeatReply:
         """Keep the attempt alive, or tell the worker to stop."""
-        async with self._database.transaction() as tx:
-            about, progress = {"task_id": beat.task_id, "attempt": beat.attempt}, beat.progress
-            await _add_log(tx, beat.task_id, beat.attempt, beat.log)
-            told = Jsonb(progress.model_dump(mode="json")) if progress else None
-            beaten = await tx.ask("beat_task", **about, progress=told)
-            if progress is not None and progress.loss is not None:
-                await tx.run("add_loss", **about, step=progress.done, loss=progress.loss)
-            await tx.run("see_worker_lightly", id=worker_id)
-            await _find_worker(tx, worker_id)
-            row = await beaten.fetchone()
-        if row is None:
+        progress = beat.progress
+        row = await self._database.first(
+            "beat",
+            worker_id=worker_id,
+            task_id=beat.task_id,
+            attempt=beat.attempt,
+            lines=beat.log,
+            progress=Jsonb(progress.model_dump(mode="json")) if progress else None,
+            step=progress.done if progress else None,
+            loss=progress.loss if progress else None,
+        )
+        if row is None or not row["known"]:
+            raise _no_worker(worker_id)
+        if row["job_state"] is None:
             return HeartbeatReply(stop=True, reason="the task was given to another attempt or is over")
         state = JobState(row["job_state"])
         if state in LIVE_JOB_STATES:
@@ -186,6 +186,8 @@ class Work:
         await transitions.complete_task(tx, task, result)
         if isinstance(result, PrepareResult):
             await tx.run("add_notes", id=job.id, notes=Jsonb(list(result.notes)))
+            prepared = result.model_dump(mode="json", exclude={"tiles"})
+            await tx.run("set_prepared", id=job.id, prepared=Jsonb(prepared))
             try:
                 planned = plan_after_prepare(result, job.settings, job.gates, self._config.limits.tiles)
             except InputError as error:
@@ -202,8 +204,8 @@ class Work:
         if isinstance(result, PackageResult):
             for artifact in result.artifacts:
                 await tx.run("add_artifact", job_id=job.id, **artifact.model_dump())
-        await _fan_in(tx, job, task, result)
         await tx.run("clear_strikes", id=task.worker_id)
+        await _fan_in(tx, job, task, result)
 
     async def fail(self, task_id: str, failure: Failure) -> None:
         """An attempt ended without a result: another may try, or the task fails."""
@@ -286,8 +288,12 @@ async def _lock(tx: Tx, task_id: str) -> TaskRow:
 async def _find_worker(tx: Tx, worker_id: str) -> WorkerRow:
     row = await tx.maybe("find_worker", id=worker_id)
     if row is None:
-        raise NotFound(f"no worker '{worker_id}'", where="worker", remedy="Register it with POST /v1/workers.")
+        raise _no_worker(worker_id)
     return WorkerRow.of(row)
+
+
+def _no_worker(worker_id: str) -> NotFound:
+    return NotFound(f"no worker '{worker_id}'", where="worker", remedy="Register it with POST /v1/workers.")
 
 
 async def _fan_in(tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:

@@ -111,6 +111,7 @@ def test_a_job_that_an_older_version_planned_ends_without_the_stage(home):
     worker.finish(worker.must_claim("prepare"))
     home.sql("DELETE FROM tasks WHERE kind = 'refine'")
     home.sql("UPDATE jobs SET settings = settings #- '{fit,solver}' #- '{fit,block}'")
+    home.sql("UPDATE jobs SET prepared = prepared - 'between'")
     home.sql("UPDATE tasks SET result = result - 'between' WHERE kind = 'prepare'")
     render = worker.must_claim("render")
     assert render["payload"]["between"] == []

@@ -20,8 +20,13 @@ def moves(row, job):
     """Every move of a task by name, as a function of a transaction."""
     worker = WorkerRow(id=row.worker_id or "", name="w", kinds=(), tags=(), orders="work", asleep=False)
     problem = transitions.IllegalTransition("x").problem()
+
+    async def claim(tx):
+        if await transitions.claim_next(tx, job.id, worker, [row.kind], 1) is None:
+            raise IllegalTransition("there was nothing to claim")
+
     return {
-        "claim": lambda tx: transitions.claim_task(tx, job, row, worker),
+        "claim": claim,
         "requeue": lambda tx: transitions.requeue_task(tx, row, "task.retried", "test", strike=True, reason=""),
         "fail": lambda tx: transitions.fail_task(tx, row, problem, "test"),
         "cancel": lambda tx: transitions.cancel_task(tx, row, "test", ""),

@@ -118,11 +118,9 @@ async def _job(parts: Parts, job_id: str) -> JobRow:
 
 
 async def _texel_map(parts: Parts, job: JobRow) -> TexelMapReader:
-    async with parts.database.transaction() as tx:
-        row = await tx.maybe("prepared_blobs", job_id=job.id)
-    if row is None:
+    if job.prepared is None:
         raise NotFound("the texel map is not made yet", where="prepare")
-    reader = TexelMapReader(parts.blobs, row["texel_map"], job.settings.lightmap.resolution)
+    reader = TexelMapReader(parts.blobs, job.prepared["texel_map"], job.settings.lightmap.resolution)
     await reader.open()
     return reader
 

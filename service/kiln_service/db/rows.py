@@ -42,6 +42,8 @@ class JobRow(_Row):
     cameras: dict[str, Camera]
     gate_results: tuple[GateResult, ...]
     store_url: str
+    prepared: dict[str, Any] | None
+    """The result of the prepare task, without the tiles."""
     priority: int
     labels: dict[str, str]
     tags: tuple[str, ...]

@@ -34,12 +34,14 @@ WHERE id = %(id)s AND state = %(before)s;
 UPDATE tasks SET state = 'queued' WHERE job_id = %(job_id)s AND kind = %(kind)s AND state = %(before)s
 RETURNING id;
 
--- name: move_task_active
--- queued, soft-failed > active: a new attempt begins.
+-- name: claim_next
+-- queued, soft-failed > active: the task of a locked job that a worker gets next; a new attempt begins.
 UPDATE tasks
-SET state = 'active', attempt = attempt + 1, worker_id = %(worker_id)s, progress = NULL,
+SET state = 'active', attempt = tasks.attempt + 1, worker_id = %(worker_id)s, progress = NULL,
     started = now(), heartbeat = now()
-WHERE id = %(id)s AND state = %(before)s;
+FROM next_task(%(worker)s, %(tags)s::text[], %(kinds)s::text[], %(job_id)s, %(stale_s)s) AS next
+WHERE tasks.id = next.id
+RETURNING tasks.*;
 
 -- name: move_task_requeued
 -- active > queued, soft-failed: the attempt ended without a result.

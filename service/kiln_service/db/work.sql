@@ -45,31 +45,8 @@ SELECT count(*) FILTER (WHERE kind = %(kind)s) AS total,
 FROM tasks WHERE job_id = %(job_id)s;
 
 -- name: pick_task
--- The task that a worker gets next, of all jobs or of one: of those that are queued, of its kinds, of jobs that go on
--- and whose tags it has. Not of a job that it is blocked for, nor one that it has failed while another worker is there
--- that has not. Job by job: taken together, the planner would sort all their tasks for every claim.
-SELECT best.* FROM jobs CROSS JOIN LATERAL (
-    SELECT tasks.* FROM tasks
-    WHERE tasks.job_id = jobs.id AND tasks.state IN ('queued', 'soft-failed') AND tasks.kind = ANY(%(kinds)s)
-      AND NOT EXISTS (
-          SELECT FROM blocks
-          WHERE worker = %(worker)s AND blocks.job_id = tasks.job_id AND blocks.kind = tasks.kind AND until > now()
-      )
-      AND (
-          tasks.state = 'queued'
-          OR NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = %(worker)s)
-          OR NOT EXISTS (
-              SELECT FROM takers(tasks.job_id, tasks.kind, %(stale_s)s) AS name
-              WHERE name <> %(worker)s
-                AND NOT EXISTS (SELECT FROM failures WHERE task_id = tasks.id AND worker = name)
-          )
-      )
-    ORDER BY tasks.rank DESC, tasks.ordinal
-    LIMIT 1
-) AS best
-WHERE jobs.state IN ('queued', 'active') AND jobs.tags <@ %(tags)s AND jobs.id = COALESCE(%(job_id)s, jobs.id)
-ORDER BY best.rank DESC, best.job_id, best.ordinal
-LIMIT 1;
+-- The task that a worker gets next, of all jobs; nothing is locked.
+SELECT job_id FROM next_task(%(worker)s, %(tags)s::text[], %(kinds)s::text[], NULL, %(stale_s)s);
 
 -- name: rank_tasks
 -- A job's place in the queue: its priority times %(step)s plus what a task's stage adds.
@@ -141,11 +118,9 @@ WHERE job_id = %(job_id)s AND kind = 'render' AND state = 'completed'
   AND (spec -> 'tile' ->> 'column')::int + (spec -> 'tile' ->> 'size')::int > %(column_start)s
 ORDER BY ordinal;
 
--- name: prepared_blobs
--- The blobs that a job's prepare task made; its whole result may list thousands of tiles.
-SELECT result ->> 'scene' AS scene, result ->> 'texel_map' AS texel_map,
-       coalesce(result -> 'between', '[]') AS between
-FROM tasks WHERE job_id = %(job_id)s AND kind = 'prepare' AND state = 'completed';
+-- name: set_prepared
+-- What a job's prepare task made, for the payloads of the tasks after it.
+UPDATE jobs SET prepared = %(prepared)s WHERE id = %(id)s;
 
 -- name: analyze_tasks
 -- Tell the planner of thousands of new rows: until then it sorts them all for every claim.
@@ -184,19 +159,30 @@ UPDATE workers SET seen = now() WHERE id = %(id)s AND seen < now() - interval '1
 -- The same in a transaction whose loss would harm nothing: its commit does not wait for the disk.
 UPDATE workers SET seen = now() WHERE id = %(id)s AND set_config('synchronous_commit', 'off', true) = 'off';
 
--- name: beat_task
--- Keep an attempt alive; no row where the attempt is not the task's current one.
-UPDATE tasks
-SET heartbeat = now(), progress = COALESCE(%(progress)s, progress)
-FROM jobs
-WHERE tasks.id = %(task_id)s AND tasks.attempt = %(attempt)s AND tasks.state = 'active' AND jobs.id = tasks.job_id
-RETURNING jobs.state AS job_state;
-
--- name: add_loss
--- Remember a running attempt's loss; one that begins again from a checkpoint tells the same steps anew.
-INSERT INTO losses (task_id, step, loss)
-SELECT id, %(step)s, %(loss)s FROM tasks WHERE id = %(task_id)s AND attempt = %(attempt)s AND state = 'active'
-ON CONFLICT (task_id, step) DO UPDATE SET loss = excluded.loss;
+-- name: beat
+-- Keep an attempt alive: its log, its progress and loss (an attempt that begins again from a checkpoint tells the same
+-- steps anew), when its worker was seen. `job_state` is NULL where the attempt is not the task's current one. Nothing is
+-- harmed if this is lost, so the commit does not wait for the disk.
+WITH alive AS (
+    UPDATE tasks
+    SET heartbeat = now(), progress = COALESCE(%(progress)s::jsonb, progress)
+    FROM jobs
+    WHERE tasks.id = %(task_id)s AND tasks.attempt = %(attempt)s AND tasks.state = 'active' AND jobs.id = tasks.job_id
+    RETURNING jobs.state AS job_state
+), said AS (
+    INSERT INTO task_logs (task_id, attempt, lines)
+    SELECT tasks.id, %(attempt)s::int, %(lines)s::text FROM tasks WHERE tasks.id = %(task_id)s AND %(lines)s::text <> ''
+), told AS (
+    INSERT INTO losses (task_id, step, loss)
+    SELECT %(task_id)s::text, %(step)s::double precision, %(loss)s::double precision
+    FROM alive WHERE %(loss)s::double precision IS NOT NULL
+    ON CONFLICT (task_id, step) DO UPDATE SET loss = excluded.loss
+), seen AS (
+    UPDATE workers SET seen = now()
+    WHERE id = %(worker_id)s AND set_config('synchronous_commit', 'off', true) = 'off'
+    RETURNING id
+)
+SELECT (SELECT job_state FROM alive) AS job_state, EXISTS (SELECT FROM seen) AS known;
 
 -- name: drop_losses
 -- Forget what attempts of a task told.

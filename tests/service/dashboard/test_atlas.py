@@ -111,7 +111,7 @@ def test_a_texel_map_of_something_else_is_a_sentence(home, job, rendered):
     header = json.dumps({"arrays": {"state": {"shape": [10**9, 10**9], "offset": 0}}}).encode()
     for data in (b"", b"KILNARR1", b"KILNARR1" + len(header).to_bytes(8, "little") + header):
         result = json.dumps(home.upload(data))
-        home.sql("UPDATE tasks SET result = jsonb_set(result, '{texel_map}', %s) WHERE kind = 'prepare'", result)
+        home.sql("UPDATE jobs SET prepared = jsonb_set(prepared, '{texel_map}', %s)", result)
         reply = home.client.get(f"/jobs/{job}/texels")
         assert reply.status_code == 422 and "does not fit the job" in reply.json()["detail"]
 
