@@ -11,7 +11,7 @@ from typing import Any, Final
 from psycopg.types.json import Jsonb
 
 from kiln_schemas.camera import Camera
-from kiln_schemas.errors import IllegalTransition, Problem
+from kiln_schemas.errors import IllegalTransition, NotFound, Problem
 from kiln_schemas.gates import GateResult, Gates, gate_problem
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import (
@@ -123,24 +123,31 @@ async def release_tasks(tx: Tx, job: JobRow, kind: TaskKind) -> None:
 
 
 async def claim_next(
-    tx: Tx, job_id: str, worker: WorkerRow, kinds: Collection[TaskKind], stale_s: float
-) -> tuple[JobRow, TaskRow] | None:
-    """queued, soft-failed > active under a new attempt: the task of a job that a worker gets next; it locks the job.
+    tx: Tx, job_id: str, askers: Sequence[tuple[WorkerRow, Collection[TaskKind]]], stale_s: float
+) -> tuple[JobRow, list[TaskRow | None]]:
+    """queued, soft-failed > active under new attempts: the tasks of a job that workers get next; it locks the job.
 
-    The job's first claim moves it to active too. None where the job has no task for this worker.
+    The job's first claim moves it to active too. None for a worker that the job has no task for.
     """
     for state in CLAIMABLE_TASK_STATES:
         check_task_move(state, TaskState.ACTIVE)
     locked = await tx.ask("lock_job", id=job_id)
-    claimed = await tx.maybe("claim_next", job_id=job_id, worker_id=worker.id, **queue.wanted(worker, kinds, stale_s))
+    asked = [
+        await tx.ask("claim_next", job_id=job_id, worker_id=worker.id, **queue.wanted(worker, kinds, stale_s))
+        for worker, kinds in askers
+    ]
     row = await locked.fetchone()
-    if claimed is None or row is None:
-        return None
-    job, task = JobRow.of(row), TaskRow.of(claimed)
-    if job.state is JobState.QUEUED:
+    if row is None:
+        raise NotFound(f"no job '{job_id}'", where="job")
+    job = JobRow.of(row)
+    found = [await cursor.fetchone() for cursor in asked]
+    tasks = [None if row is None else TaskRow.of(row) for row in found]
+    if any(tasks) and job.state is JobState.QUEUED:
         job = await move_job(tx, job, JobState.ACTIVE, COORDINATOR)
-    await _task_event(tx, task, "task.claimed", f"worker:{worker.id}", {"worker": worker.name})
-    return job, task
+    for (worker, _), task in zip(askers, tasks, strict=True):
+        if task is not None:
+            await _task_event(tx, task, "task.claimed", f"worker:{worker.id}", {"worker": worker.name})
+    return job, tasks
 
 
 async def requeue_task(tx: Tx, task: TaskRow, kind: str, actor: str, *, strike: bool, reason: str) -> None:

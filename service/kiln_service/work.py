@@ -35,10 +35,11 @@ from kiln_schemas.tasks import (
     WorkerRegistration,
 )
 from kiln_service import queue, transitions
+from kiln_service.batches import Batches
 from kiln_service.blobs import drop_blobs, require_blobs, use_blobs
 from kiln_service.blocks import note_failure
 from kiln_service.config import ServiceConfig
-from kiln_service.db import Database, JobRow, TaskRow, Tx, WorkerRow
+from kiln_service.db import Database, JobRow, TaskRow, Tx, WorkerRow, fetched
 from kiln_service.events import QUEUED_CHANNEL, Signals, add_event, wait
 from kiln_service.ids import new_id
 from kiln_service.jobs import settle_cancel
@@ -55,6 +56,8 @@ class Work:
 
     def __init__(self, database: Database, config: ServiceConfig, signals: Signals) -> None:
         self._database, self._config, self._signals = database, config, signals
+        self._claims = Batches(database, self._claim_all)
+        self._renders = Batches(database, self._commit_renders)
 
     async def register(self, registration: WorkerRegistration) -> str:
         """A new worker's id; Conflict where it is of another version than this coordinator."""
@@ -111,15 +114,23 @@ class Work:
             if job_id is None:
                 await tx.run("see_worker_lightly", id=worker_id)
                 return _NOTHING
-        async with self._database.turn(job_id) as tx:
-            # Others may have claimed what was seen.
-            claimed = await transitions.claim_next(tx, job_id, worker, kinds, stale_s)
-            if claimed is None:
-                return _GONE
-            job, task = claimed
-            await tx.run("see_worker", id=worker_id)
-            payload = await build_payload(tx, job, task)
-        return Claim(task_id=task.id, job_id=job.id, attempt=task.attempt, payload=payload, checkpoint=task.checkpoint)
+        return await self._claims.ask(job_id, (worker, kinds)) or _GONE
+
+    async def _claim_all(
+        self, tx: Tx, job_id: str, askers: Sequence[tuple[WorkerRow, Sequence[TaskKind]]]
+    ) -> list[Claim | Exception | None]:
+        """A task of the job for each worker; None where others have claimed what it saw."""
+        job, tasks = await transitions.claim_next(tx, job_id, askers, self._config.timing.stale_s)
+        claims: list[Claim | Exception | None] = []
+        for (worker, _), task in zip(askers, tasks, strict=True):
+            if task is None:
+                claims.append(None)
+                continue
+            await tx.run("see_worker", id=worker.id)
+            payload, checkpoint = await build_payload(tx, job, task), task.checkpoint
+            claim = Claim(task_id=task.id, job_id=job.id, attempt=task.attempt, payload=payload, checkpoint=checkpoint)
+            claims.append(claim)
+        return claims
 
     async def heartbeat(self, worker_id: str, beat: Heartbeat) -> HeartbeatReply:
         """Keep the attempt alive, or tell the worker to stop."""
@@ -163,6 +174,10 @@ class Work:
 
     async def commit(self, task_id: str, commit: Commit) -> None:
         """Take an attempt's result. The same commit again (its answer was lost) is no error."""
+        if isinstance(commit.result, RenderResult):
+            job_id = await job_of(self._database, task_id)
+            if await self._renders.ask(job_id, (task_id, commit)):
+                return
         stopped: StaleAttempt | None = None
         async with locked_task(self._database, task_id) as (tx, job, task):
             if _is_repeated(task, commit):
@@ -177,6 +192,33 @@ class Work:
                 await self._accept(tx, job, task, commit.result)
         if stopped:
             raise stopped
+
+    async def _commit_renders(
+        self, tx: Tx, job_id: str, commits: Sequence[tuple[str, Commit]]
+    ) -> list[bool | Exception]:
+        """Tiles of a job that goes on, which are most of its commits; False for all where it does not."""
+        locked = await tx.ask("lock_job", id=job_id)
+        tasks = [await tx.ask("lock_task", id=task_id) for task_id, _ in commits]
+        job = JobRow.of(await fetched(locked))
+        if job.state not in LIVE_JOB_STATES:
+            return [False] * len(commits)
+        answers: list[bool | Exception] = []
+        rendered: tuple[TaskRow, Result] | None = None
+        for cursor, (_, commit) in zip(tasks, commits, strict=True):
+            task = TaskRow.of(await fetched(cursor))
+            try:
+                if not _is_repeated(task, commit):
+                    _check_fence(task, commit.attempt)
+                    _check_result(job, task, commit.result)
+                    await transitions.complete_task(tx, task, commit.result)
+                    await tx.run("clear_strikes", id=task.worker_id)
+                    rendered = task, commit.result
+                answers.append(True)
+            except KilnError as error:
+                answers.append(error)
+        if rendered is not None:
+            await _fan_in(tx, job, *rendered)
+        return answers
 
     async def _accept(self, tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
         """Complete the task, publish what it made, and go on with the job."""
@@ -270,15 +312,19 @@ _GONE: Final = _Outcome()
 @asynccontextmanager
 async def locked_task(database: Database, task_id: str) -> AsyncIterator[tuple[Tx, JobRow, TaskRow]]:
     """A transaction with a task and its job, both locked, the job first."""
-    owner = await database.first("job_of_task", id=task_id)
-    if owner is None:
-        raise NotFound(f"no task '{task_id}'", where="task")
-    async with database.turn(owner["job_id"]) as tx:
-        locked = await tx.ask("lock_job", id=owner["job_id"])
+    job_id = await job_of(database, task_id)
+    async with database.turn(job_id), database.transaction() as tx:
+        locked = await tx.ask("lock_job", id=job_id)
         task = await _lock(tx, task_id)
-        job = await locked.fetchone()
-        assert job is not None, "jobs with tasks are never deleted"
-        yield tx, JobRow.of(job), task
+        yield tx, JobRow.of(await fetched(locked)), task
+
+
+async def job_of(database: Database, task_id: str) -> str:
+    """The id of a task's job."""
+    row = await database.first("job_of_task", id=task_id)
+    if row is None:
+        raise NotFound(f"no task '{task_id}'", where="task")
+    return str(row["job_id"])
 
 
 async def _lock(tx: Tx, task_id: str) -> TaskRow:

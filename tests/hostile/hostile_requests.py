@@ -335,7 +335,7 @@ def _workers() -> Iterator[Call]:
         failure = {"attempt": attempt, "problem": problem, "retryable": True}
         yield posted(f"a failure of attempt {attempt}", f"/v1/tasks/{NOBODY}/fail", failure, 422, "attempt")
     beat = {"task_id": "a\0b", "attempt": 1}
-    yield posted("a beat for U+0000", f"/v1/workers/{NOBODY}/heartbeat", beat, 404, "worker")
+    yield posted("a beat for U+0000", f"/v1/workers/{NOBODY}/heartbeat", beat, 422, "U+0000")
     log = {"task_id": NOBODY, "attempt": 1, "log": "x" * 65537}
     yield posted("a log of 65537 letters", f"/v1/workers/{NOBODY}/heartbeat", log, 422, "log")
     for name in ("../../.bashrc", "/etc/passwd", "a/../b", "..", ".", "a//b", "a\\b", "a\nb", "a\0b", "x" * 201, ""):

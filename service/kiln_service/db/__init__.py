@@ -1,6 +1,6 @@
 """The database: named queries in .sql files, migrations, and one thin layer over psycopg to run them."""
 
-from kiln_service.db.database import Database, Tx, execute
+from kiln_service.db.database import Database, Tx, execute, fetched
 from kiln_service.db.rows import JobRow, TaskRow, WorkerRow, picked
 
-__all__ = ["Database", "JobRow", "TaskRow", "Tx", "WorkerRow", "execute", "picked"]
+__all__ = ["Database", "JobRow", "TaskRow", "Tx", "WorkerRow", "execute", "fetched", "picked"]

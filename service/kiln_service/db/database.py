@@ -76,10 +76,7 @@ class Tx:
 
     async def one(self, query: str, **parameters: Any) -> DictRow:
         """The row that must be there."""
-        row = await self.maybe(query, **parameters)
-        if row is None:
-            raise InternalError(f"query '{query}' gave no row")
-        return row
+        return await fetched(await self.ask(query, **parameters))
 
 
 class Database:
@@ -115,11 +112,9 @@ class Database:
             await tx.check_moves()
             await connection.commit()  # together with what was not waited for
 
-    @asynccontextmanager
-    async def turn(self, job_id: str) -> AsyncIterator[Tx]:
-        """A transaction that begins by locking this job; in one coordinator they come one after the other, in order."""
-        async with self._turns.setdefault(job_id, asyncio.Lock()), self.transaction() as tx:
-            yield tx
+    def turn(self, job_id: str) -> asyncio.Lock:
+        """What transactions that begin by locking this job wait for first; in one coordinator they come in order."""
+        return self._turns.setdefault(job_id, asyncio.Lock())
 
     async def first(self, query: str, **parameters: Any) -> DictRow | None:
         """The first row of one query that is a transaction of its own, or None."""
@@ -133,6 +128,14 @@ class Database:
     async def dedicated(self) -> psycopg.AsyncConnection[DictRow]:
         """A connection outside the pool, in autocommit, for LISTEN and session locks; the caller closes it."""
         return await psycopg.AsyncConnection.connect(self.dsn, autocommit=True, row_factory=dict_row)
+
+
+async def fetched(cursor: AsyncCursor[DictRow]) -> DictRow:
+    """The next row, which must be there."""
+    row = await cursor.fetchone()
+    if row is None:
+        raise InternalError("a query gave no row")
+    return row
 
 
 async def execute(
