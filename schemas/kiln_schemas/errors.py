@@ -25,9 +25,9 @@ A message names the place (mesh, file, field), the value and the remedy.
 import errno
 from typing import ClassVar, Final, Self
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
-from kiln_schemas.base import Contract
+from kiln_schemas.base import Contract, Name, Word
 from kiln_schemas.text import Place, Told
 
 DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -37,11 +37,11 @@ DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 class Problem(Contract):
     """An error as `application/problem+json` and as stored with a failed task."""
 
-    type: str = "about:blank"
-    title: str
-    status: int
+    type: Name = "about:blank"
+    title: Name
+    status: int = Field(ge=100, le=599)
     detail: Told
-    code: str
+    code: Word
     """Stable slug for programs: `input`, `fit-failed`, `stale-attempt`, ..."""
     where: Place | None = None
     """The mesh, file or field at fault."""

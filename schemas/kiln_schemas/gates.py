@@ -12,7 +12,7 @@ from typing import Annotated, Final, Self
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from kiln_schemas.base import Contract
+from kiln_schemas.base import FLOAT32_MAX, Contract, Name
 from kiln_schemas.camera import Camera, CameraName, read_camera
 from kiln_schemas.errors import GateFailed, InputError, Problem
 
@@ -49,13 +49,13 @@ class Gates(Contract):
 class GateResult(Contract):
     """One gate, measured."""
 
-    name: str
-    value: float = Field(ge=0.0)
+    name: Name
+    value: float = Field(ge=0.0, le=FLOAT32_MAX)
     threshold: Threshold
     passed: bool
-    flip_of_halves: float | None = Field(default=None, ge=0.0)
+    flip_of_halves: float | None = Field(default=None, ge=0.0, le=FLOAT32_MAX)
     """Of a FLIP gate: FLIP of the reference's two halves."""
-    noise_floor: float | None = Field(default=None, ge=0.0)
+    noise_floor: float | None = Field(default=None, ge=0.0, le=FLOAT32_MAX)
     """Of a FLIP gate: what a package without any error would measure, for the noise of the reference."""
 
     @model_validator(mode="after")

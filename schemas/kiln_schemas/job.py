@@ -4,17 +4,17 @@ import re
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import PurePosixPath
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
-from kiln_schemas.base import Contract
+from kiln_schemas.base import Contract, Count, Detail, Id, Magnitude, Name, Real, Seconds, Word
 from kiln_schemas.errors import InputError, Problem
-from kiln_schemas.gates import Cameras, GateResult, Gates
+from kiln_schemas.gates import MOST_CAMERAS, Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
-from kiln_schemas.tasks import PATH_LENGTH, Bundle, Progress, Sha256, Tags, TaskKind
-from kiln_schemas.text import LINE_BREAK, UNFIT, Line, told
+from kiln_schemas.tasks import MOST_NOTES, MOST_POINTS, PATH_LENGTH, Bundle, Progress, Sha256, Tags, TaskKind
+from kiln_schemas.text import LINE_BREAK, UNFIT, Line, Note, told
 
 DEFAULT_PRIORITY: Final = 50
 
@@ -23,7 +23,7 @@ LABEL_KEY: Final = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,62}$"
 LABEL_LENGTH: Final = 128
 PART_BYTES: Final = 255
 """Longest name of a file or folder on the file systems in use."""
-LabelKey = Annotated[str, Field(pattern=LABEL_KEY)]
+LabelKey = Annotated[str, Field(pattern=LABEL_KEY, max_length=63)]
 LabelValue = Annotated[Line, Field(max_length=LABEL_LENGTH)]
 Labels = Annotated[dict[LabelKey, LabelValue], Field(max_length=32)]
 
@@ -33,8 +33,8 @@ class JobRequest(Contract):
 
     name: Line = Field(min_length=1, max_length=128)
     bundle: Bundle
-    preset: str | None = None
-    set: tuple[str, ...] = Field(default=(), max_length=256)
+    preset: Word | None = None
+    set: tuple[Name, ...] = Field(default=(), max_length=256)
     settings: BakeSettings | None = None
     gates: Gates = Gates()
     cameras: Cameras = Field(default_factory=dict)
@@ -56,7 +56,7 @@ class JobChange(Contract):
     """All tags that its workers need from now on."""
 
 
-TexelRange = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]]
+TexelRange = tuple[Annotated[int, Field(ge=0, lt=2**31)], Annotated[int, Field(ge=1, lt=2**31)]]
 
 
 class RequeueRequest(Contract):
@@ -70,7 +70,7 @@ class RequeueRequest(Contract):
     """Only tiles or blocks with texels in these rows of the light map: the first, and the one after the last."""
     columns: TexelRange | None = None
     """The same of columns."""
-    labels: tuple[str, ...] | None = Field(default=None, max_length=4096)
+    labels: tuple[Word, ...] | None = Field(default=None, max_length=4096)
     """Only tasks with these labels."""
 
 
@@ -78,61 +78,61 @@ class StageView(Contract):
     """Progress of one stage of a job, in tasks and in fractions of tasks."""
 
     kind: TaskKind
-    total: int
-    completed: int
-    active: int
-    failed: int
-    soft_failed: int = 0
+    total: Count
+    completed: Count
+    active: Count
+    failed: Count
+    soft_failed: Count = 0
     """Of those that are queued: after attempts that ended badly."""
-    fraction: float
-    """0..1, running tasks counted by their own progress."""
-    seconds: float
+    fraction: float = Field(ge=0, le=1)
+    """Running tasks counted by their own progress."""
+    seconds: Magnitude
     """Busy seconds of completed tasks, added up."""
 
 
 class JobView(Contract):
-    id: str
-    name: str
+    id: Id
+    name: Name
     state: JobState
     settings: BakeSettings
     bundle: Bundle
     created: datetime
     started: datetime | None
     finished: datetime | None
-    stages: tuple[StageView, ...]
-    remaining_s: float | None
+    stages: tuple[StageView, ...] = Field(max_length=len(TaskKind))
+    remaining_s: Seconds | None
     """Estimate from the finished tasks; None until there is something to estimate from."""
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = Field(default=(), max_length=MOST_NOTES)
     error: Problem | None = None
     gates: Gates = Gates()
     cameras: Cameras = Field(default_factory=dict)
-    gate_results: tuple[GateResult, ...] = ()
+    gate_results: tuple[GateResult, ...] = Field(default=(), max_length=MOST_CAMERAS + 2)
     """Empty until the package has been measured."""
-    priority: int = DEFAULT_PRIORITY
-    labels: dict[str, str] = Field(default_factory=dict)
-    tags: tuple[str, ...] = ()
+    priority: Priority = DEFAULT_PRIORITY
+    labels: Labels = Field(default_factory=dict)
+    tags: Tags = ()
     outcome: JobState | None = None
     """How it ended, also when it is archived; None before."""
-    submitter: str | None = None
+    submitter: Name | None = None
     """Name of the token it was submitted with."""
-    renders_of: str | None = None
+    renders_of: Id | None = None
     """The job whose light fields it uses, where they are the same; nothing was rendered again then."""
 
 
 class JobPage(Contract):
-    jobs: tuple[JobView, ...]
-    next: str | None = None
+    jobs: tuple[JobView, ...] = Field(max_length=1000)
+    next: Id | None = None
     """Cursor of the next page."""
 
 
 class TaskView(Contract):
-    id: str
+    id: Id
     kind: TaskKind
-    label: str
+    label: Word
     """`tile 16,32`, `light_field`, ..."""
     state: TaskState
-    attempt: int
-    worker: str | None
+    attempt: Count
+    worker: Name | None
     progress: Progress | None
     created: datetime
     started: datetime | None
@@ -143,27 +143,27 @@ class TaskView(Contract):
 class CurveView(Contract):
     """How the loss of a task went so far."""
 
-    task_id: str
+    task_id: Id
     kind: TaskKind
-    label: str
+    label: Word
     state: TaskState
-    steps: float | None
+    steps: Magnitude | None
     """How many there will be; None before the task has told."""
-    points: tuple[tuple[float, float], ...]
+    points: tuple[tuple[Magnitude, Real], ...] = Field(max_length=MOST_POINTS)
     """(step, training loss), in the order of steps."""
 
 
 class EventView(Contract):
     """One line of a job's append-only history."""
 
-    id: int
+    id: Count
     at: datetime
-    job_id: str
-    task_id: str | None = None
-    kind: str
+    job_id: Id
+    task_id: Id | None = None
+    kind: Word
     """`job.completed`, `task.claimed`, `task.retried`, ..."""
-    actor: str
-    detail: dict[str, Any] = Field(default_factory=dict)
+    actor: Name
+    detail: Detail = Field(default_factory=dict)
 
 
 class MissingRequest(Contract):
@@ -173,7 +173,7 @@ class MissingRequest(Contract):
 
 
 class MissingReply(Contract):
-    missing: tuple[Sha256, ...]
+    missing: tuple[Sha256, ...] = Field(max_length=4096)
 
 
 def read_labels(words: Sequence[str], where: str = "--label") -> dict[str, str]:

@@ -2,14 +2,15 @@
 
 from datetime import datetime, time
 from enum import StrEnum
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import AfterValidator, Field, field_validator
 
-from kiln_schemas.base import Contract
+from kiln_schemas.base import Contract, Count, Detail, Id, Name, Url, Word
 from kiln_schemas.receivers import check_receiver
-from kiln_schemas.tasks import TaskKind
+from kiln_schemas.tasks import Bytes, Tags, TaskKind
+from kiln_schemas.text import Told
 
 
 class Scope(StrEnum):
@@ -62,7 +63,7 @@ class SleepSchedule(Contract):
     begins: time
     ends: time
     """Where this is not after `begins`, the span ends on the next day."""
-    timezone: str = Field(default="UTC", max_length=64)
+    timezone: Word = "UTC"
     """IANA name, as in `Europe/Stockholm`."""
 
     @field_validator("timezone")
@@ -85,50 +86,51 @@ class SleepSchedule(Contract):
 class BlockView(Contract):
     """A worker gets no tasks of a kind of a job, since it failed some."""
 
-    job_id: str
+    job_id: Id
     kind: TaskKind
     until: datetime
 
 
 class WorkerView(Contract):
-    id: str
-    name: str
+    id: Id
+    name: Name
     state: WorkerState
-    kinds: tuple[TaskKind, ...]
-    memory_bytes: int
-    threads: int
-    device: str
-    version: str
+    kinds: tuple[TaskKind, ...] = Field(max_length=32)
+    memory_bytes: Bytes
+    threads: Count
+    device: Name
+    version: Word
     registered: datetime
     seen: datetime
-    task_id: str | None = None
-    job_id: str | None = None
-    task: str | None = None
+    task_id: Id | None = None
+    job_id: Id | None = None
+    task: Name | None = None
     """Kind and label of the task at hand."""
-    tags: tuple[str, ...] = ()
+    tags: Tags = ()
     schedule: SleepSchedule | None = None
     """When workers of its name sleep."""
-    blocks: tuple[BlockView, ...] = ()
+    blocks: tuple[BlockView, ...] = Field(default=(), max_length=1000)
     """Of workers of its name."""
 
 
-TokenName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+TokenName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", max_length=64)]
+Scopes = Annotated[tuple[Scope, ...], Field(min_length=1, max_length=len(Scope))]
 
 
 class TokenRequest(Contract):
     """Body of `POST /v1/tokens`."""
 
     name: TokenName
-    scopes: tuple[Scope, ...] = Field(min_length=1, max_length=4)
+    scopes: Scopes
 
 
 class TokenView(Contract):
     """A token as the coordinator knows it: never itself."""
 
-    name: str
-    scopes: tuple[Scope, ...]
+    name: Word
+    scopes: Scopes
     created: datetime
-    created_by: str
+    created_by: Name
     used: datetime | None = None
     """When it was last used, to the minute."""
 
@@ -136,7 +138,7 @@ class TokenView(Contract):
 class NewToken(TokenView):
     """Answer of `POST /v1/tokens`, the only time that the token is told."""
 
-    token: str
+    token: Name
 
 
 class JobEvent(StrEnum):
@@ -166,31 +168,31 @@ class WebhookRequest(Contract):
 
 
 class WebhookView(Contract):
-    id: str
-    url: str
-    events: tuple[JobEvent, ...]
+    id: Id
+    url: Url
+    events: tuple[JobEvent, ...] = Field(max_length=len(JobEvent))
     created: datetime
-    created_by: str
+    created_by: Name
 
 
 class NewWebhook(WebhookView):
     """Answer of `POST /v1/webhooks`, the only time that the secret is told."""
 
-    secret: str
+    secret: Name
 
 
 class DeliveryView(Contract):
     """What became of one telling."""
 
-    id: int
-    event: str
-    job_id: str
-    outcome: str
+    id: Count
+    event: Word
+    job_id: Id
+    outcome: Word
     """`pending`, `delivered` or `failed` (after twelve attempts)."""
-    attempts: int
-    status: int | None
+    attempts: Count
+    status: Count | None
     """Of the receiver's last answer."""
-    error: str | None
+    error: Told | None
     """Why there was no answer."""
     due: datetime
     ended: datetime | None
@@ -206,11 +208,11 @@ class GcRequest(Contract):
 class Freed(Contract):
     """What one archived job left behind."""
 
-    job_id: str
-    name: str
-    stores: tuple[str, ...]
+    job_id: Id
+    name: Name
+    stores: tuple[Url, ...] = Field(max_length=2)
     """Light-field stores that are gone."""
-    blob_bytes: int
+    blob_bytes: Bytes
     """Of blobs that nobody else uses; they go with the next collection."""
 
 
@@ -218,16 +220,16 @@ class GcReport(Contract):
     """Answer of `POST /v1/gc`."""
 
     dry_run: bool
-    jobs: tuple[Freed, ...]
+    jobs: tuple[Freed, ...] = Field(max_length=1_000_000)
 
 
 class AuditEntry(Contract):
     """One line of the record."""
 
-    id: int
+    id: Count
     at: datetime
-    actor: str
-    action: str
+    actor: Name
+    action: Word
     """`token.created`, `token.revoked`, `worker.drain`, ..."""
-    target: str
-    detail: dict[str, Any] = Field(default_factory=dict)
+    target: Name
+    detail: Detail = Field(default_factory=dict)

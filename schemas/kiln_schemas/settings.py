@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from pydantic import Field, ValidationError, field_validator
 
-from kiln_schemas.base import Contract
+from kiln_schemas.base import Contract, Word
 from kiln_schemas.errors import InputError
 
 
@@ -108,7 +108,7 @@ class PackageSettings(Contract):
 class BakeSettings(Contract):
     """Everything that determines a bake, apart from the scene and the environment."""
 
-    preset: str
+    preset: Word
     seed: int = Field(default=0, ge=0, le=2**32 - 1)
     lightmap: LightmapSettings
     render: RenderSettings

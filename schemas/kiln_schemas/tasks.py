@@ -10,18 +10,29 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from kiln_schemas.base import Contract
+from kiln_schemas.base import Contract, Count, Id, Magnitude, Name, Real, Seconds, Url, Word
 from kiln_schemas.errors import InputError, Problem
-from kiln_schemas.gates import Cameras, GateResult, Gates
+from kiln_schemas.gates import MOST_CAMERAS, Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings, Function
-from kiln_schemas.text import Line, Log, Note
+from kiln_schemas.text import Line, Log, Note, Told
 
-Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", max_length=64)]
 PATH_LENGTH: Final = 512
 BundlePath = Annotated[str, Field(min_length=1, max_length=PATH_LENGTH)]
 Number = Annotated[int, Field(ge=0, lt=2**31)]
 """A count or an index that the database holds in 32 bits."""
 Bytes = Annotated[int, Field(ge=0, lt=2**63)]
+MOST_TILES: Final = 65536
+"""Of a job; the coordinator's configuration may allow fewer."""
+MOST_NOTES: Final = 1001
+"""Of a scene: a thousand, and one that tells how many are left out."""
+MOST_POINTS: Final = 10_000
+"""Of a curve."""
+MOST_FILES: Final = 4096
+"""Of a bundle, and of a package."""
+TILE_TEXELS: Final = 64 * 64
+Between = Annotated[tuple[Sha256, ...], Field(max_length=3)]
+Renders = Annotated[tuple["RenderResult", ...], Field(max_length=MOST_TILES)]
 
 
 class TaskKind(StrEnum):
@@ -47,7 +58,7 @@ class Bundle(Contract):
     """A scene as a set of blobs: relative POSIX paths to hashes."""
 
     entry: BundlePath
-    files: dict[BundlePath, Sha256] = Field(min_length=1, max_length=4096)
+    files: dict[BundlePath, Sha256] = Field(min_length=1, max_length=MOST_FILES)
     environment: EnvironmentRef | None = None
 
 
@@ -72,27 +83,27 @@ class PreparePayload(Contract):
     kind: Literal[TaskKind.PREPARE] = TaskKind.PREPARE
     bundle: Bundle
     settings: BakeSettings
-    store_url: str
+    store_url: Url
 
 
 class RenderPayload(Contract):
     kind: Literal[TaskKind.RENDER] = TaskKind.RENDER
     scene: Sha256
     texel_map: Sha256
-    between: tuple[Sha256, ...] = ()
+    between: Between = ()
     """Texel maps of the between points, one a kind (`PrepareResult.between`)."""
     tile: Tile
     settings: BakeSettings
-    store_url: str
+    store_url: Url
 
 
 class FitPayload(Contract):
     kind: Literal[TaskKind.FIT] = TaskKind.FIT
     function: Function
     texel_map: Sha256
-    renders: tuple["RenderResult", ...]
+    renders: Renders
     settings: BakeSettings
-    store_url: str
+    store_url: Url
 
 
 class RefinePayload(Contract):
@@ -101,26 +112,26 @@ class RefinePayload(Contract):
     kind: Literal[TaskKind.REFINE] = TaskKind.REFINE
     block: Block
     texel_map: Sha256
-    between: tuple[Sha256, ...] = ()
-    renders: tuple["RenderResult", ...]
+    between: Between = ()
+    renders: Renders
     """Of the tiles within the block and `conventions.REFINE_HALO` texels around it."""
     fit: "FitResult"
     settings: BakeSettings
-    store_url: str
+    store_url: Url
 
 
 class PackagePayload(Contract):
     kind: Literal[TaskKind.PACKAGE] = TaskKind.PACKAGE
-    job_id: str
-    job_name: str
+    job_id: Id
+    job_name: Name
     bundle: Bundle
     prepare: "PrepareResult"
-    renders: tuple["RenderResult", ...]
-    fits: tuple["FitResult", ...]
-    refines: tuple["RefineResult", ...] = ()
+    renders: Renders
+    fits: tuple["FitResult", ...] = Field(max_length=len(Function))
+    refines: tuple["RefineResult", ...] = Field(default=(), max_length=MOST_TILES)
     """Of the light field, one a block; none where the network's lobes are final."""
     settings: BakeSettings
-    store_url: str
+    store_url: Url
     gates: Gates = Gates()
     cameras: Cameras = Field(default_factory=dict)
 
@@ -136,48 +147,48 @@ class PrepareResult(Contract):
     """The parsed scene (`kiln_workers.scene.archive`)."""
     texel_map: Sha256
     """The texel map (`kiln_workers.scene.texels`)."""
-    between: tuple[Sha256, ...] = ()
+    between: Between = ()
     """Texel maps of the points half-way between texels: to the right, below, and the corner; none where unused."""
     scene_hash: Sha256
     """Hash of all that the light depends on; render seeds derive from it."""
-    tiles: tuple[Tile, ...]
+    tiles: tuple[Tile, ...] = Field(max_length=MOST_TILES)
     """Only tiles with at least one texel."""
     has_environment: bool
     has_light: bool
-    triangles: int
-    notes: tuple[Note, ...] = ()
+    triangles: Count
+    notes: tuple[Note, ...] = Field(default=(), max_length=MOST_NOTES)
     """What was decided for the user: per-mesh unwrapping, ignored features, dropped faces."""
-    seconds: float
+    seconds: Seconds
 
 
 class RenderResult(Contract):
     kind: Literal[TaskKind.RENDER] = TaskKind.RENDER
     tile: Tile
-    paths: int
-    overflows: int
+    paths: Count
+    overflows: Count
     """Values clamped to the fp16 range."""
-    invalid: int
+    invalid: Count
     """Texels that see mostly back faces; filled from their neighbours when packaging."""
-    invalid_texels: tuple[int, ...] = ()
+    invalid_texels: tuple[Annotated[int, Field(ge=0, lt=TILE_TEXELS)], ...] = Field(default=(), max_length=TILE_TEXELS)
     """Those texels, as row-major indices inside the tile."""
-    seconds: float
+    seconds: Seconds
 
 
 class FitMetrics(Contract):
     """Errors as defined in docs/mathematics.md (`log_mse`: no jitter, exposure-normalised)."""
 
-    log_mse: float
-    log_mse_zero: float
+    log_mse: Magnitude
+    log_mse_zero: Magnitude
     """log_mse of P = 0."""
-    log_mse_rel: float
-    texels: int
+    log_mse_rel: Magnitude
+    texels: Count
     signal: bool
     """False where the function is zero everywhere and there is nothing to fit."""
 
 
 class CurvePoint(Contract):
-    step: int
-    loss: float
+    step: Count
+    loss: Real
     """The jittered training loss, not the error."""
 
 
@@ -185,11 +196,11 @@ class FitResult(Contract):
     kind: Literal[TaskKind.FIT] = TaskKind.FIT
     function: Function
     weights: Sha256
-    exposure: float
+    exposure: Magnitude
     metrics: FitMetrics
-    curve: tuple[CurvePoint, ...]
-    steps: int
-    seconds: float
+    curve: tuple[CurvePoint, ...] = Field(max_length=MOST_POINTS)
+    steps: Count
+    seconds: Seconds
 
 
 class RefineResult(Contract):
@@ -197,9 +208,9 @@ class RefineResult(Contract):
     block: Block
     lobes: Sha256
     """Lobes [T, N, 7] in scene units of the block's T valid texels, row by row (`kiln_workers.fit.solvers.joint`)."""
-    texels: int
-    steps: int
-    seconds: float
+    texels: Count
+    steps: Count
+    seconds: Seconds
 
 
 class Artifact(Contract):
@@ -214,10 +225,10 @@ class Artifact(Contract):
 
 class PackageResult(Contract):
     kind: Literal[TaskKind.PACKAGE] = TaskKind.PACKAGE
-    artifacts: tuple[Artifact, ...]
-    gates: tuple[GateResult, ...] = ()
+    artifacts: tuple[Artifact, ...] = Field(max_length=MOST_FILES)
+    gates: tuple[GateResult, ...] = Field(default=(), max_length=MOST_CAMERAS + 2)
     """One of each gate of the payload, met or not."""
-    seconds: float
+    seconds: Seconds
 
 
 Result = Annotated[PrepareResult | RenderResult | FitResult | RefineResult | PackageResult, Field(discriminator="kind")]
@@ -226,14 +237,14 @@ Result = Annotated[PrepareResult | RenderResult | FitResult | RefineResult | Pac
 class Progress(Contract):
     """How far a running attempt is; `done` of `total` in the unit of its kind."""
 
-    done: float = Field(ge=0)
-    total: float = Field(gt=0)
-    unit: str
-    message: str = ""
-    loss: float | None = None
+    done: float = Field(ge=0, le=1e15)
+    total: float = Field(ge=1e-6, le=1e15)
+    unit: Word
+    message: Note = ""
+    loss: Real | None = None
 
 
-Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$")]
+Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$", max_length=63)]
 Tags = Annotated[tuple[Tag, ...], Field(max_length=32)]
 
 
@@ -249,8 +260,8 @@ class WorkerRegistration(Contract):
 
 
 class WorkerWelcome(Contract):
-    worker_id: str
-    heartbeat_s: float
+    worker_id: Id
+    heartbeat_s: Seconds
     """Beat at least this often while a task runs."""
 
 
@@ -263,8 +274,8 @@ class ClaimRequest(Contract):
 class Claim(Contract):
     """A task handed to a worker under a fence: every later call carries `attempt`."""
 
-    task_id: str
-    job_id: str
+    task_id: Id
+    job_id: Id
     attempt: Number
     payload: Payload
     checkpoint: Sha256 | None = None
@@ -272,7 +283,7 @@ class Claim(Contract):
 
 
 class Heartbeat(Contract):
-    task_id: str
+    task_id: Id
     attempt: Number
     progress: Progress | None = None
     log: Log = ""
@@ -282,7 +293,7 @@ class Heartbeat(Contract):
 class HeartbeatReply(Contract):
     stop: bool
     """The attempt is no longer wanted: drop the work."""
-    reason: str = ""
+    reason: Told = ""
 
 
 class Commit(Contract):

@@ -19,8 +19,8 @@ NOTE_LENGTH: Final = 500
 
 def told(text: str, length: int = DETAIL_LENGTH) -> str:
     r"""At most `length` characters of `text`, and what is not fit to be shown as its escape (`\x1b`)."""
-    shown = text if len(text) <= length else f"{text[: length - 1]}…"
-    return UNFIT.sub(lambda match: match[0].encode("unicode_escape").decode(), shown)
+    shown = UNFIT.sub(lambda match: match[0].encode("unicode_escape").decode(), text[: length + 1])
+    return shown if len(shown) <= length else f"{shown[: length - 1]}…"
 
 
 def check_line(text: str) -> str:
@@ -37,11 +37,11 @@ def _told(length: int) -> BeforeValidator:
 
 Line = Annotated[str, AfterValidator(check_line)]
 """A name that a client gives."""
-Told = Annotated[str, _told(DETAIL_LENGTH)]
+Told = Annotated[str, Field(max_length=DETAIL_LENGTH), _told(DETAIL_LENGTH)]
 """What is told to people."""
-Place = Annotated[str, _told(PLACE_LENGTH)]
+Place = Annotated[str, Field(max_length=PLACE_LENGTH), _told(PLACE_LENGTH)]
 """A place in an input: a file, a mesh, a field."""
-Note = Annotated[str, _told(NOTE_LENGTH)]
+Note = Annotated[str, Field(max_length=NOTE_LENGTH), _told(NOTE_LENGTH)]
 """A remark on a scene, with names from it."""
 Log = Annotated[
     str,

@@ -5,17 +5,35 @@ not in it: access tokens appear as hashes only (`auth.py`).
 """
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import BeforeValidator, Field, ValidationError, field_validator
 
-from kiln_schemas.base import Contract
+from kiln_schemas.base import Contract, Name, Url
 from kiln_schemas.errors import InputError
-from kiln_schemas.operators import Scope
-from kiln_schemas.tasks import Sha256
+from kiln_schemas.job import Labels
+from kiln_schemas.operators import Scopes
+from kiln_schemas.tasks import MOST_TILES, Sha256
 
 OWN_TOKEN: Final = "owner"
 """Name of the token in the data folder."""
+LONGEST_PATH: Final = 4096
+
+Interval = Annotated[float, Field(gt=0, le=1e9)]
+"""Seconds."""
+Bound = Annotated[int, Field(gt=0, lt=2**63)]
+StorageUrl = Annotated[str, Field(max_length=1024)]
+"""Leaves room for the names below it in a contract's `Url`."""
+Days = Annotated[float, Field(ge=0, le=36500)]
+
+
+def _short_path(value: object) -> object:
+    if len(str(value)) > LONGEST_PATH:
+        raise ValueError(f"is longer than {LONGEST_PATH} characters")
+    return value
+
+
+Folder = Annotated[Path, Field(json_schema_extra={"maxLength": LONGEST_PATH}), BeforeValidator(_short_path)]
 
 
 class TokenEntry(Contract):
@@ -23,15 +41,15 @@ class TokenEntry(Contract):
 
     name: str = Field(min_length=1, max_length=64)
     sha256: Sha256
-    scopes: tuple[Scope, ...] = Field(min_length=1)
+    scopes: Scopes
 
 
 class Rate(Contract):
     """A token bucket (`kiln_service.rates`)."""
 
-    per_s: float = Field(gt=0)
+    per_s: float = Field(gt=0, le=1e9)
     """Requests a second in the long run."""
-    burst: int = Field(ge=1)
+    burst: int = Field(ge=1, lt=2**31)
     """Requests at once."""
 
 
@@ -49,15 +67,15 @@ class Rates(Contract):
 class Limits(Contract):
     """Bounds that keep one client from exhausting the coordinator."""
 
-    blob_bytes: int = Field(default=8 * 2**30, gt=0)
+    blob_bytes: Bound = 8 * 2**30
     """Largest blob."""
-    body_bytes: int = Field(default=16 * 2**20, gt=0)
+    body_bytes: Bound = 16 * 2**20
     """Largest body of any request but a blob upload."""
-    reserve_bytes: int = Field(default=256 * 2**20, ge=0)
+    reserve_bytes: int = Field(default=256 * 2**20, ge=0, lt=2**63)
     """Uploads are refused when the disk would have less free space than this."""
-    page: int = Field(default=200, gt=0)
+    page: Bound = 200
     """Most jobs on a page."""
-    tiles: int = Field(default=65536, gt=0)
+    tiles: int = Field(default=MOST_TILES, gt=0, le=MOST_TILES)
     """Most render tiles of a job, and most blocks to refine."""
     rates: Rates = Rates()
     """How often one caller may ask."""
@@ -66,26 +84,26 @@ class Limits(Contract):
 class Timing(Contract):
     """Intervals in seconds."""
 
-    heartbeat_s: float = Field(default=3.0, gt=0)
+    heartbeat_s: Interval = 3.0
     """Told to workers: beat this often while a task runs. A canceled task has stopped after this and two seconds."""
-    stale_s: float = Field(default=30.0, gt=0)
+    stale_s: Interval = 30.0
     """A running task without a heartbeat for this long has lost its worker."""
-    poll_s: float = Field(default=1.0, gt=0)
+    poll_s: Interval = 1.0
     """Longest sleep of a waiting claim or event stream (a retried job sends no NOTIFY)."""
-    database_s: float = Field(default=15.0, gt=0)
+    database_s: Interval = 15.0
     """A request waits so long for a database connection before it is answered 503."""
-    maintenance_s: float = Field(default=5.0, gt=0)
+    maintenance_s: Interval = 5.0
     """Between two passes of the reaper."""
-    block_s: float = Field(default=3600.0, gt=0)
+    block_s: Interval = 3600.0
     """A worker that fails tasks of a kind of a job gets no more of them for so long (`blocks`)."""
-    blob_grace_s: float = Field(default=3600.0, gt=0)
+    blob_grace_s: Interval = 3600.0
     """A blob that nothing uses is kept this long after it was last uploaded or asked for."""
 
 
 class FailedTasks(Contract):
     """A task that fails leaves the others to go on; a job of which so many failed fails at once."""
 
-    least: int = Field(default=10, ge=1)
+    least: int = Field(default=10, ge=1, lt=2**31)
     """At least so many tasks of a kind,"""
     of_all: float = Field(default=0.1, ge=0, le=1)
     """and more than this share of all tasks of the kind."""
@@ -94,39 +112,39 @@ class FailedTasks(Contract):
 class Retention(Contract):
     """How long jobs that are over keep what they have; nothing goes where no days are given."""
 
-    archive_days: float | None = Field(default=None, ge=0)
+    archive_days: Days | None = None
     """A job is archived so many days after its end."""
-    free_days: float | None = Field(default=None, ge=0)
+    free_days: Days | None = None
     """An archived job gives up its light fields so many days after its end; its package stays."""
-    log_days: float | None = Field(default=None, ge=0)
+    log_days: Days | None = None
     """What a job's tasks logged goes so many days after the job's end; its events stay."""
-    keep: dict[str, str] = Field(default={"keep": "true"})
+    keep: Labels = Field(default={"keep": "true"})
     """Jobs with one of these labels are left alone."""
-    check_s: float = Field(default=3600.0, gt=0)
+    check_s: Interval = 3600.0
     """Seconds between two rounds."""
 
 
 class ServiceConfig(Contract):
     """A coordinator. Without `database` an embedded PostgreSQL is run in `<data>/postgres`."""
 
-    data: Path
+    data: Folder
     """Folder for the token, temporary files and, by default, everything else."""
-    host: str = "127.0.0.1"
+    host: Name = "127.0.0.1"
     port: int = Field(default=8321, ge=0, le=65535)
-    database: str | None = None
+    database: Url | None = None
     """libpq connection string."""
-    storage_url: str | None = None
+    storage_url: StorageUrl | None = None
     """Where light-field stores and blobs go, `file://` or `s3://`, reachable from every worker; `data` by default."""
-    store_url: str | None = None
+    store_url: StorageUrl | None = None
     """Where light-field stores go instead; `<storage>/store` by default."""
-    blob_url: str | None = None
+    blob_url: StorageUrl | None = None
     """Where blobs (uploads, what tasks make, artifacts) go instead; `<storage>/blobs` by default."""
-    tokens: tuple[TokenEntry, ...] = ()
+    tokens: tuple[TokenEntry, ...] = Field(default=(), max_length=1000)
     """Tokens besides the one in `<data>/token`."""
-    max_attempts: int = Field(default=4, ge=1)
+    max_attempts: int = Field(default=4, ge=1, lt=2**31)
     """A task fails for good after this many attempts in a row that ended without a new checkpoint."""
     failed_tasks: FailedTasks = FailedTasks()
-    pool_size: int = Field(default=10, ge=2)
+    pool_size: int = Field(default=10, ge=2, le=1000)
     """Database connections."""
     limits: Limits = Limits()
     timing: Timing = Timing()

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from kiln_schemas.errors import InputError
+from kiln_schemas.errors import InputError, TooLarge
 from kiln_schemas.job import check_bundle
 from kiln_schemas.settings import BakeSettings, Function, Solver
-from kiln_schemas.tasks import Bundle, PreparePayload, PrepareResult
+from kiln_schemas.tasks import MOST_NOTES, MOST_TILES, Bundle, PreparePayload, PrepareResult
 from kiln_workers.render.between import between_maps
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import pack_scene, scene_hash
@@ -22,7 +22,6 @@ from kiln_workers.stages.tiles import plan_tiles
 from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
 from kiln_workers.store.light_field import LightFieldStore
 
-MOST_NOTES: Final = 1000
 STEPS: Final = (
     "fetching the scene",
     "reading the scene",
@@ -57,6 +56,12 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
             where=bundle.entry,
             remedy="Check the size of its light-map charts.",
         )
+    if len(tiles) > MOST_TILES:
+        raise TooLarge(
+            f"{len(tiles)} render tiles are more than {MOST_TILES}",
+            where="lightmap.tile",
+            remedy="Raise lightmap.tile or lower lightmap.resolution.",
+        )
     step(4)
     between = between_maps(scene, texel_map) if traces_between(settings) else ()
     step(5)
@@ -86,7 +91,8 @@ def few_notes(notes: Sequence[str]) -> tuple[str, ...]:
     """The first notes; a scene of a hundred thousand meshes has as many to tell."""
     if len(notes) <= MOST_NOTES:
         return tuple(notes)
-    return (*notes[:MOST_NOTES], f"{len(notes) - MOST_NOTES} more notes are left out.")
+    kept = MOST_NOTES - 1
+    return (*notes[:kept], f"{len(notes) - kept} more notes are left out.")
 
 
 def _lay_out(bundle: Bundle, context: Context) -> Path:
