@@ -22,7 +22,7 @@ from kiln_workers.scene.gltf_document import (
     parse_extension,
     pick,
 )
-from kiln_workers.scene.images import decode_image
+from kiln_workers.scene.images import LOW_RANGE, decode_image
 from kiln_workers.scene.limits import MAX_IMAGE_BYTES
 from kiln_workers.scene.model import Float32, Image, Material, TextureRef
 
@@ -142,7 +142,7 @@ def make_image(data: bytes, name: str, srgb: bool, where: str, others: Sequence[
     pixels = np.asarray(decoded.pixels, dtype=np.float32)
     if not np.isfinite(pixels).all():
         raise InputError("holds values that are not finite", where=where, remedy="Save it again.")
-    encoded = srgb and decoded.format in ("png", "jpg")
+    encoded = srgb and decoded.format in LOW_RANGE
     return Image(name, linearised(pixels) if encoded else pixels, srgb=False)
 
 

@@ -1,8 +1,9 @@
-"""Decoding of PNG, JPEG, OpenEXR and Radiance HDR images from bytes with OpenImageIO.
+"""Decoding of PNG, JPEG, WebP, OpenEXR and Radiance HDR images from bytes with OpenImageIO.
 
-The format is told by the first bytes, not by the file's name, and only these four formats are ever given to a decoder.
+The format is told by the first bytes, not by the file's name, and only these five formats are ever given to a decoder.
 OpenImageIO's Python module opens files only, so the bytes pass through a temporary file whose suffix fits the format.
-Row 0 is the top of the picture.
+Row 0 is the top of the picture. Colours are as the file stores them: OpenImageIO would multiply them by alpha, and
+glTF's alpha (3.9.4) does not darken a colour.
 """
 
 import tempfile
@@ -23,9 +24,12 @@ SIGNATURES: Final[Mapping[str, bytes]] = {
     "jpg": b"\xff\xd8\xff",
     "exr": b"\x76\x2f\x31\x01",
     "hdr": b"#?",
+    "webp": b"RIFF",
 }
 HDR_FORMATS: Final = frozenset({"exr", "hdr"})
-DECODERS: Final[Mapping[str, str]] = {"png": "png", "jpg": "jpeg", "exr": "openexr", "hdr": "hdr"}
+LOW_RANGE: Final = frozenset({"png", "jpg", "webp"})
+"""Formats whose colours are encoded as sRGB says."""
+DECODERS: Final[Mapping[str, str]] = {"png": "png", "jpg": "jpeg", "exr": "openexr", "hdr": "hdr", "webp": "webp"}
 """OpenImageIO's names of the formats."""
 
 # What a decoder refuses is not offered to the fifty others.
@@ -34,7 +38,7 @@ oiio.attribute("try_all_readers", 0)
 
 @dataclass(frozen=True)
 class Decoded:
-    """An image and the format that it came in (`png`, `jpg`, `exr`, `hdr`)."""
+    """An image and the format that it came in (a key of SIGNATURES)."""
 
     pixels: npt.NDArray[np.uint8] | npt.NDArray[np.float32]  # [H, W, C]; 8 bits as they are, all else as float
     format: str
@@ -42,7 +46,8 @@ class Decoded:
 
 def image_format(data: bytes) -> str | None:
     """The format that the first bytes tell, None for any other."""
-    return next((name for name, magic in SIGNATURES.items() if data.startswith(magic)), None)
+    kind = next((name for name, magic in SIGNATURES.items() if data.startswith(magic)), None)
+    return None if kind == "webp" and data[8:12] != b"WEBP" else kind
 
 
 def decode_image(data: bytes, where: str, most_bytes: int = MAX_IMAGE_BYTES) -> Decoded:
@@ -50,7 +55,7 @@ def decode_image(data: bytes, where: str, most_bytes: int = MAX_IMAGE_BYTES) -> 
     kind = image_format(data)
     if kind is None:
         raise InputError(
-            "is neither PNG, JPEG, OpenEXR nor Radiance HDR", where=where, remedy="Convert it to one of these."
+            "is neither PNG, JPEG, WebP, OpenEXR nor Radiance HDR", where=where, remedy="Convert it to one of these."
         )
     with tempfile.TemporaryDirectory(prefix="kiln-image-") as folder:
         path = Path(folder) / f"image.{kind}"
@@ -59,7 +64,9 @@ def decode_image(data: bytes, where: str, most_bytes: int = MAX_IMAGE_BYTES) -> 
 
 
 def _read(path: Path, kind: str, where: str, most_bytes: int) -> npt.NDArray[np.uint8] | npt.NDArray[np.float32]:
-    source = oiio.ImageInput.open(str(path))
+    unmultiplied = oiio.ImageSpec()
+    unmultiplied.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), unmultiplied)
     if source is None or source.format_name() != DECODERS[kind]:
         raise InputError(f"cannot be decoded as {kind}: {oiio.geterror()}", where=where, remedy="Save it again.")
     try:
@@ -71,7 +78,7 @@ def _read(path: Path, kind: str, where: str, most_bytes: int) -> npt.NDArray[np.
             raise InputError(f"is a volume of {spec.depth} layers", where=where, remedy="Save one layer.")
         if (spec.width, spec.height, spec.x, spec.y) != (spec.full_width, spec.full_height, spec.full_x, spec.full_y):
             raise InputError("its data window is not its display window", where=where, remedy="Save it uncropped.")
-        narrow = kind in ("png", "jpg") and spec.format.basetype == oiio.UINT8
+        narrow = kind in LOW_RANGE and spec.format.basetype == oiio.UINT8
         decoded = spec.width * spec.height * min(spec.nchannels, 4) * (1 if narrow else 4)
         check_count(decoded, most_bytes, "bytes when it is decoded beside the others", where, "Use smaller textures.")
         pixels = source.read_image(0, 0, 0, min(spec.nchannels, 4), oiio.UINT8 if narrow else oiio.FLOAT)
