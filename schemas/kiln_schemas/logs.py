@@ -8,8 +8,10 @@ Ids come from `bound`, which holds for everything logged within its block, and f
 
 import json
 import logging
+import math
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
@@ -51,13 +53,45 @@ def fields_of(record: logging.LogRecord) -> dict[str, Any]:
     return (_bound.get() or {}) | own
 
 
+class Seldom(logging.Filter):
+    """Lets `most` lines of a kind through each minute, so that nobody fills the disk with them from outside.
+
+    `kind` tells a record's kind, None where it always passes. The next line that passes says how many were left out.
+    """
+
+    def __init__(
+        self,
+        kind: Callable[[logging.LogRecord], str | None],
+        most: int = 20,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__()
+        self._kind, self._most, self._clock = kind, most, clock
+        self._seen: dict[str, tuple[float, int]] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the line is written."""
+        kind = self._kind(record)
+        if kind is None:
+            return True
+        began, count = self._seen.get(kind, (-math.inf, 0))
+        if self._clock() - began < 60:
+            self._seen[kind] = began, count + 1
+            return count < self._most
+        if count > self._most:
+            record.msg = f"{record.getMessage()} ({count - self._most} more like this before)"
+            record.args = ()
+        self._seen[kind] = self._clock(), 1
+        return True
+
+
 class JsonFormatter(logging.Formatter):
     """One JSON object a record."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as one line."""
-        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        line = {"time": time, "level": record.levelname.lower(), "logger": record.name, "message": record.getMessage()}
+        at = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        line = {"time": at, "level": record.levelname.lower(), "logger": record.name, "message": record.getMessage()}
         line |= {name: value for name, value in fields_of(record).items() if name not in line}
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)

@@ -5,16 +5,21 @@ token with every scope, in the file `token` of the data folder, readable by its 
 configuration, or were made by an operator (`operators.create_token`) and are looked up in the database.
 """
 
+import asyncio
 import hashlib
 import hmac
 import os
 import re
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from psycopg import OperationalError
+from psycopg.rows import DictRow
 
 from kiln_schemas.errors import AuthError, Forbidden, InputError
 from kiln_schemas.operators import Scope
@@ -56,14 +61,15 @@ class TokenBook:
     def __init__(self, entries: Sequence[TokenEntry]) -> None:
         self._entries = tuple(entries)
         self._remembered: dict[str, tuple[Principal, float]] = {}
+        self._lookups = Lookups()
 
-    async def authenticate(
-        self, header: str | None, database: Database, before_lookup: Callable[[], None] = lambda: None
-    ) -> Principal:
-        """The caller with this Authorization header; AuthError where there is none or the token is unknown.
+    async def session_token(self, cookie: str, database: Database) -> str | None:
+        """The sha256 of the token that a session's cookie stands for; None where there is no such session."""
+        row = await self._lookups.find("find_sessions", digest_of(cookie), database)
+        return None if row is None else str(row["token_sha256"])
 
-        `before_lookup` may refuse by an exception before the database is asked for a token.
-        """
+    async def authenticate(self, header: str | None, database: Database) -> Principal:
+        """The caller with this Authorization header; AuthError where there is none or the token is unknown."""
         if not header:
             raise AuthError(
                 "no token was sent",
@@ -72,7 +78,7 @@ class TokenBook:
             )
         scheme, _, token = header.partition(" ")
         known = scheme.lower() == "bearer"
-        principal = await self.find(digest_of(token.strip()), database, before_lookup) if known else None
+        principal = await self.find(digest_of(token.strip()), database) if known else None
         if principal is None:
             raise AuthError(
                 "the token is not known here",
@@ -81,9 +87,7 @@ class TokenBook:
             )
         return principal
 
-    async def find(
-        self, digest: str, database: Database, before_lookup: Callable[[], None] = lambda: None
-    ) -> Principal | None:
+    async def find(self, digest: str, database: Database) -> Principal | None:
         """Whose token has this sha256."""
         found: TokenEntry | None = None
         for entry in self._entries:  # all of them, so that the time tells nothing
@@ -91,27 +95,58 @@ class TokenBook:
                 found = entry
         if found is not None:
             return Principal(found.name, frozenset(found.scopes))
-        return await self._stored(digest, database, before_lookup)
+        return await self._stored(digest, database)
 
-    async def _stored(self, digest: str, database: Database, before_lookup: Callable[[], None]) -> Principal | None:
+    async def _stored(self, digest: str, database: Database) -> Principal | None:
         """Whose token of the database has this hash, as of MEMORY_S ago or later."""
         now = time.monotonic()
         principal, until = self._remembered.get(digest, (None, 0.0))
         if principal is not None and now < until:
             return principal
         self._remembered.pop(digest, None)
-        before_lookup()
-        async with database.transaction() as tx:
-            row = await tx.maybe("find_token", sha256=digest)
-            if row is None:
-                return None
-            if row["unnoticed"]:
-                await tx.run("use_token", sha256=digest)
+        row = await self._lookups.find("find_tokens", digest, database)
+        if row is None:
+            return None
         principal = Principal(row["name"], frozenset(Scope(scope) for scope in row["scopes"]))
         if len(self._remembered) >= MEMORY_SIZE:
             self._remembered.clear()
         self._remembered[digest] = principal, now + MEMORY_S
         return principal
+
+
+class Lookups:
+    """Finds rows by hash. Whatever is asked for while a query runs is looked up together by the next one.
+
+    So guesses, however many come in, cost one connection and one indexed query at a time, and the holder of a valid
+    token waits for two queries at most.
+    """
+
+    def __init__(self) -> None:
+        self._turns: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._waiting: defaultdict[str, dict[str, asyncio.Future[DictRow | None]]] = defaultdict(dict)
+
+    async def find(self, query: str, digest: str, database: Database) -> DictRow | None:
+        """The row of this hash, or None. `query` takes `hashes` and gives rows with a column `sha256`."""
+        waiting = self._waiting[query]
+        answer = waiting.setdefault(digest, asyncio.get_running_loop().create_future())
+        async with self._turns[query]:
+            if not answer.done():
+                batch, self._waiting[query] = self._waiting[query], {}
+                await self._answer(query, batch, database)
+        return answer.result()
+
+    async def _answer(self, query: str, batch: dict[str, asyncio.Future[DictRow | None]], database: Database) -> None:
+        try:
+            async with database.transaction() as tx:
+                rows = {row["sha256"]: row for row in await tx.all(query, hashes=list(batch))}
+        except BaseException as error:  # whoever waits gets the same answer, also where this request was given up
+            failure = error if isinstance(error, Exception) else OperationalError("the look-up was given up")
+            for future in batch.values():
+                future.set_exception(failure)
+                future.exception()  # some of those who asked may have left
+            raise
+        for digest, future in batch.items():
+            future.set_result(rows.get(digest))
 
 
 def digest_of(secret: str) -> str:

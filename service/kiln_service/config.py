@@ -4,6 +4,7 @@
 not in it: access tokens appear as hashes only (`auth.py`).
 """
 
+import ipaddress
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -61,7 +62,21 @@ class Rates(Contract):
     workers: Rate = Rate(per_s=5000, burst=20000)
     """A token on the routes of workers, tasks and blobs: a whole farm may share it."""
     failures: Rate = Rate(per_s=5, burst=1000)
-    """An address that fails to sign in."""
+    """An address (of IPv6 a /64 network) that fails to sign in; whoever has a valid token is not concerned."""
+
+
+class ConnectionLimits(Contract):
+    """How many connections there may be, and how slow each (`kiln_service.connections`)."""
+
+    all: int = Field(default=16384, ge=1, lt=2**20)
+    """At once; fewer where the process may not open as many descriptors (256 are kept for other uses)."""
+    of_address: int = Field(default=4096, ge=1, lt=2**20)
+    """Of one address at once: the workers of a farm may share one."""
+    head_s: float = Field(default=10.0, gt=0, le=86400)
+    """A new connection, or one that is kept open, has to send the whole head of a request within so long."""
+    stall_s: float = Field(default=30.0, gt=0, le=86400)
+    """A body has to come, and an answer to be read, at `bytes_per_s` over each span of so long."""
+    bytes_per_s: float = Field(default=512.0, ge=0, le=1e9)
 
 
 class Limits(Contract):
@@ -79,6 +94,7 @@ class Limits(Contract):
     """Most render tiles of a job, and most blocks to refine."""
     rates: Rates = Rates()
     """How often one caller may ask."""
+    connections: ConnectionLimits = ConnectionLimits()
 
 
 class Timing(Contract):
@@ -139,6 +155,8 @@ class ServiceConfig(Contract):
     """Where light-field stores go instead; `<storage>/store` by default."""
     blob_url: StorageUrl | None = None
     """Where blobs (uploads, what tasks make, artifacts) go instead; `<storage>/blobs` by default."""
+    trusted_proxies: tuple[Name, ...] = Field(default=(), max_length=1000)
+    """Addresses and networks of proxies whose `X-Forwarded-For` and `X-Forwarded-Proto` are believed."""
     tokens: tuple[TokenEntry, ...] = Field(default=(), max_length=1000)
     """Tokens besides the one in `<data>/token`."""
     max_attempts: int = Field(default=4, ge=1, lt=2**31)
@@ -156,6 +174,13 @@ class ServiceConfig(Contract):
         if url is not None and not url.startswith(("file:///", "s3://")):
             raise ValueError("must begin with file:/// or s3://")
         return url
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _are_addresses(cls, proxies: tuple[str, ...]) -> tuple[str, ...]:
+        for proxy in proxies:
+            ipaddress.ip_network(proxy)
+        return proxies
 
     @property
     def store_base(self) -> str:

@@ -3,10 +3,8 @@
 Pure ASGI middleware, so that streamed bodies pass through untouched.
 """
 
-import contextlib
 import logging
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 from urllib.parse import quote
 
@@ -36,6 +34,7 @@ from kiln_service import sessions
 from kiln_service.auth import Principal, TokenBook
 from kiln_service.config import Limits
 from kiln_service.ids import new_id
+from kiln_service.rates import address_of
 from kiln_service.requests import Requests
 
 log = logging.getLogger(__name__)
@@ -235,7 +234,11 @@ class Authentication:
         if scope["type"] == "http" and not is_open(scope["path"]):
             request = Request(scope)
             try:
-                scope["principal"] = await self._who(request)
+                try:
+                    scope["principal"] = await self._who(request)
+                except AuthError:
+                    await request.app.state.rates.failed(address_of(request))
+                    raise
                 request.app.state.rates.count(scope["principal"].name, scope["path"])
             except AuthError as error:
                 response = _sign_in_first(request) or problem_response(error.problem())
@@ -255,31 +258,11 @@ class Authentication:
         cookie = sessions.read_cookie(request.headers)
         safe = request.method in sessions.SAFE_METHODS
         if header is not None or cookie is None or not (safe or is_page(request.url.path)):
-            return await self._by_token(request, header)
+            return await self._tokens.authenticate(header, database)
         if not safe:
             sessions.check_origin(request.headers)
         request.scope["session"] = cookie
-        with _counted(request) as may_sign_in:
-            may_sign_in()
-            return await sessions.principal_of(database, self._tokens, cookie)
-
-    async def _by_token(self, request: Request, header: str | None) -> Principal:
-        with _counted(request) as may_sign_in:
-            return await self._tokens.authenticate(header, request.app.state.parts.database, before_lookup=may_sign_in)
-
-
-@contextlib.contextmanager
-def _counted(request: Request) -> Iterator[Callable[[], None]]:
-    """Count it where the block fails to sign in; gives what refuses an address that failed too often.
-
-    Called before the database is asked for a token or a session, which is what guesses cost.
-    """
-    rates, address = request.app.state.rates, request.client.host if request.client else ""
-    try:
-        yield partial(rates.may_sign_in, address)
-    except AuthError:
-        rates.failed(address)
-        raise
+        return await sessions.principal_of(database, self._tokens, cookie)
 
 
 def _sign_in_first(request: Request) -> Response | None:

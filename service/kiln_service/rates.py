@@ -2,21 +2,28 @@
 
 A bucket holds `burst` requests and is filled again with `per_s` a second; a request that finds it empty is answered 429
 with the seconds to wait. Callers are access tokens; workers' routes have a bucket of their own, as a whole farm may
-share one token. Whoever has not signed in is an address: only requests that fail to sign in count there, and an
-address that failed too often is refused before its token is looked up.
+share one token. Whoever has not signed in is an address: only requests that fail to sign in count there. Once an
+address has failed too often, each further failure is answered late and with 429; a valid token or session is never
+refused for what others at its address do.
 """
 
+import asyncio
+import ipaddress
 import math
 import time
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Final
 
+from starlette.requests import Request
+
 from kiln_schemas.errors import TooMany
 from kiln_service.config import Rate, Rates
 
 REMEMBERED: Final = 10_000
 """Callers whose buckets are kept; the one that asked the longest ago is forgotten first."""
+SLOWED_S: Final = 1.0
+"""So late is a failure to sign in answered at an address that failed too often."""
 _WORKERS: Final = ("/v1/workers", "/v1/tasks/", "/v1/blobs/")
 
 
@@ -37,12 +44,6 @@ class Buckets:
         if len(self._levels) > REMEMBERED:
             self._levels.popitem(last=False)
 
-    def check(self, caller: str) -> None:
-        """TooMany where the next request would find the bucket empty."""
-        level = self._level(caller)
-        if level < 1:
-            raise TooMany("too many requests", wait_s=self._wait_s(level))
-
     def _level(self, caller: str) -> float:
         level, then = self._levels.get(caller, (self._rate.burst, 0.0))
         return min(self._rate.burst, level + (self._clock() - then) * self._rate.per_s)
@@ -62,10 +63,28 @@ class RateLimits:
         """Count a request of a caller who has signed in; TooMany where there were too many."""
         (self._workers if path.startswith(_WORKERS) else self._clients).take(token)
 
-    def failed(self, address: str) -> None:
-        """Count a sign-in that failed."""
-        self._failures.take(address)
+    async def failed(self, address: str) -> None:
+        """Count a sign-in that failed; TooMany, after a pause, where the address has failed too often."""
+        try:
+            self._failures.take(address)
+        except TooMany:
+            await asyncio.sleep(SLOWED_S)
+            raise
 
-    def may_sign_in(self, address: str) -> None:
-        """TooMany where an address has failed to sign in too often."""
-        self._failures.check(address)
+
+def address_of(request: Request) -> str:
+    """Where a request comes from, as far as it is counted: behind a trusted proxy, the proxy's client."""
+    return network_of(request.client.host if request.client else "")
+
+
+def network_of(host: str) -> str:
+    """An IPv4 address as it is, of an IPv6 address the /64 network, which one customer has to himself."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host
+    if isinstance(address, ipaddress.IPv4Address):
+        return str(address)
+    if address.ipv4_mapped is not None:
+        return str(address.ipv4_mapped)
+    return str(ipaddress.IPv6Network((address, 64), strict=False))

@@ -24,18 +24,28 @@ import uvicorn
 from fastapi import FastAPI
 
 from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, MachineLacks
-from kiln_schemas.logs import LogFormat, set_up
+from kiln_schemas.logs import LogFormat, Seldom, set_up
 from kiln_service.app import create_app
 from kiln_service.auth import OWNER_VARIABLE, TOKEN_FILE
 from kiln_service.config import ServiceConfig, make_config
+from kiln_service.connections import ACCEPTED_AT_ONCE, Connections, protocol, raise_descriptors
 from kiln_service.embedded import EmbeddedPostgres
 
 log = logging.getLogger("kiln_service")
 
 GRACE_S: Final = 5
 """Open connections get this long to end when the coordinator stops."""
+BACKLOG: Final = 2048
+"""Connections that the kernel keeps until they are accepted."""
 WATCH_S: Final = 1.0
 """Between two looks at whether the embedded database still runs."""
+FLOODED: Final = {
+    "asyncio": lambda record: str(record.msg)[:32],
+    "uvicorn.error": lambda record: str(record.msg)[:32],
+    "kiln_service.connections": lambda record: str(record.msg),
+    "kiln_service.requests": lambda record: None if record.token is not None else f"{record.route} {record.status}",
+}
+"""Loggers of lines that anybody without a token can cause, and the kinds of these lines."""
 
 
 class Server(uvicorn.Server):
@@ -48,6 +58,8 @@ class Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets=sockets)
+        for listening in sockets or ():
+            listening.listen(BACKLOG)
         if not self.should_exit:
             print(self._announce, flush=True)
 
@@ -81,6 +93,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run; the exit code (errors as in kiln_schemas.errors)."""
     arguments = _parser().parse_args(argv)
     set_up(LogFormat(arguments.log_format), arguments.log_level)
+    for name, kind in FLOODED.items():
+        logging.getLogger(name).addFilter(Seldom(kind))
     try:
         config = _config(arguments)
         _prepare_folder(config.data)
@@ -108,12 +122,7 @@ def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json:
         where = f"given by {OWNER_VARIABLE}" if given else f"in {token_file}"
         announce = json.dumps(ready) if as_json else f"lightkiln serves {url} (token {where})"
         app = create_app(config)
-        server = Server(
-            app,
-            uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_S, lifespan="on"),
-            announce,
-            database,
-        )
+        server = Server(app, server_config(app, config), announce, database)
         # uvicorn ends the process where the application does not start; the sentence below is ours.
         with _quiet_signals(), contextlib.suppress(SystemExit):
             asyncio.run(server.serve_all([listening]))
@@ -129,6 +138,22 @@ def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json:
             "the coordinator could not start", remedy="Check --database; the log on standard error says more."
         )
     return 0
+
+
+def server_config(app: FastAPI, config: ServiceConfig) -> uvicorn.Config:
+    """How uvicorn serves the application: bounded connections, forwarded addresses from named proxies only."""
+    connections = Connections(config.limits.connections, raise_descriptors())
+    return uvicorn.Config(
+        app,
+        http=protocol(connections),
+        backlog=ACCEPTED_AT_ONCE,
+        proxy_headers=bool(config.trusted_proxies),
+        forwarded_allow_ips=list(config.trusted_proxies),
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=GRACE_S,
+        lifespan="on",
+    )
 
 
 @contextlib.contextmanager
@@ -160,7 +185,7 @@ def _bound(host: str, port: int) -> socket.socket:
             where=f"{host}:{port}",
             remedy="Choose another --port (0 takes a free one) or --host.",
         ) from None
-    listening.listen(128)
+    listening.listen(BACKLOG)
     return listening
 
 

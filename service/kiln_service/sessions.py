@@ -41,9 +41,8 @@ async def begin(database: Database, tokens: TokenBook, token: str) -> str:
 
 async def principal_of(database: Database, tokens: TokenBook, value: str) -> Principal:
     """Who is signed in with this cookie; AuthError where nobody is (any more)."""
-    async with database.transaction() as tx:
-        row = await tx.maybe("find_session", sha256=digest_of(value))
-    principal = None if row is None else await tokens.find(row["token_sha256"], database)
+    token = await tokens.session_token(value, database)
+    principal = None if token is None else await tokens.find(token, database)
     if principal is None:
         raise AuthError("nobody is signed in with this cookie", where="Cookie", remedy="Sign in again.")
     return principal

@@ -1,13 +1,17 @@
 """Who asks too often is told how long to wait, and nobody else is."""
 
+import asyncio
+
 import httpx
 import pytest
 
 from kiln_schemas.client import Client
-from kiln_schemas.errors import TooMany, wait_asked
+from kiln_schemas.errors import InputError, TooMany, wait_asked
 from kiln_schemas.tasks import TaskKind, WorkerRegistration
-from kiln_service.config import Limits, Rate, Rates
-from kiln_service.rates import REMEMBERED, Buckets
+from kiln_service.auth import digest_of
+from kiln_service.config import Limits, Rate, Rates, make_config
+from kiln_service.db import Tx
+from kiln_service.rates import REMEMBERED, Buckets, network_of
 from kiln_workers.runner.client import CoordinatorClient
 
 SLOW = Rate(per_s=0.01, burst=3)
@@ -30,13 +34,12 @@ def test_a_bucket_empties_and_fills():
     with pytest.raises(TooMany, match=r"in 1 s"):
         buckets.take("a")
     now[0] += 0.1
-    buckets.check("a")
     buckets.take("a")
     now[0] += 1000
     for _ in range(2):
         buckets.take("a")
     with pytest.raises(TooMany):
-        buckets.check("a")
+        buckets.take("a")
 
 
 def test_callers_without_end_do_not_fill_the_memory():
@@ -65,28 +68,87 @@ def test_a_token_that_asks_too_often_is_told_when_to_return(start):
         home.upload(b"and so do its blobs")
 
 
-def test_sign_ins_that_fail_are_bounded_and_known_tokens_are_not(start):
+def test_guesses_are_bounded_and_valid_tokens_and_sessions_are_not(start, monkeypatch):
+    """The tokens are new to the coordinator when the guesses have been made: it has to look them up."""
+    monkeypatch.setattr("kiln_service.auth.MEMORY_S", 0.0)
+    monkeypatch.setattr("kiln_service.rates.SLOWED_S", 0.1)
     with start(limits=limits(failures=SLOW)) as home:
         token = home.client.post("/v1/tokens", json={"name": "ci", "scopes": ["read"]}).json()["token"]
+        signed_in = httpx.post(f"{home.url}/login", data={"token": token})
+        session = {"kiln_session": signed_in.cookies["kiln_session"]}
 
         def asked(word):
             return httpx.get(f"{home.url}/v1/jobs", headers={"Authorization": f"Bearer {word}"}).status_code
 
-        assert [asked(f"guess-{n}") for n in range(5)] == [401, 401, 401, 429, 429]
-        assert asked(token) == 429, "to look it up would be another guess"
-        assert home.client.get("/v1/jobs").status_code == 200
-        assert httpx.get(f"{home.url}/healthz").status_code == 200
-
-
-def test_guessed_cookies_and_forms_are_bounded_too(start):
-    with start(limits=limits(failures=SLOW)) as home:
-
         def shown(cookie):
             return httpx.get(f"{home.url}/jobs", cookies={"kiln_session": cookie}).status_code
 
-        assert [shown(f"guess-{n}") for n in range(5)] == [401, 401, 401, 429, 429]
-        refused = httpx.post(f"{home.url}/login", data={"token": home.token})
+        assert [asked(f"guess-{n}") for n in range(5)] == [401, 401, 401, 429, 429]
+        assert shown("guess") == 429
+        refused = httpx.post(f"{home.url}/login", data={"token": "guess"})
         assert refused.status_code == 429 and int(refused.headers["retry-after"]) > 0
+        assert asked(token) == asked(home.token) == 200
+        assert httpx.get(f"{home.url}/jobs", cookies=session).status_code == 200
+        assert httpx.post(f"{home.url}/login", data={"token": token}).status_code == 303
+        assert httpx.get(f"{home.url}/healthz").status_code == 200
+
+
+def test_guesses_that_come_together_are_looked_up_together(start):
+    """Whatever waits is one query, so that a valid token among a thousand guesses waits for two at most."""
+    with start(limits=limits(failures=Rate(per_s=1, burst=10**6))) as home:
+        token = home.client.post("/v1/tokens", json={"name": "ci", "scopes": ["read"]}).json()["token"]
+        book, database = home.app.state.parts.tokens, home.app.state.parts.database
+        asked, all_of = [], Tx.all
+
+        async def counted(tx, query, **parameters):
+            asked.append((query, len(parameters["hashes"])))
+            return await all_of(tx, query, **parameters)
+
+        async def together():
+            words = [*(f"guess-{n}" for n in range(1000)), token]
+            return await asyncio.gather(*(book.find(digest_of(word), database) for word in words))
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Tx, "all", counted)
+            found = asyncio.run_coroutine_threadsafe(together(), home.loop).result()
+        assert [principal.name for principal in found if principal] == ["ci"]
+        assert [query for query, _ in asked] == ["find_tokens"] * len(asked)
+        assert len(asked) <= 2 and sum(count for _, count in asked) == 1001
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+def test_forwarded_addresses_count_where_the_proxy_is_trusted(start, monkeypatch, trusted):
+    monkeypatch.setattr("kiln_service.rates.SLOWED_S", 0.0)
+    proxies = {"trusted_proxies": ("127.0.0.1",)} if trusted else {}
+    with start(limits=limits(failures=SLOW), **proxies) as home:
+
+        def guess(client):
+            headers = {"Authorization": "Bearer guess", "X-Forwarded-For": client}
+            return httpx.get(f"{home.url}/v1/jobs", headers=headers).status_code
+
+        assert [guess(f"192.0.2.{n}") for n in range(5)] == ([401] * 5 if trusted else [401] * 3 + [429] * 2)
+        # The proxy appends what it sees: what its client has made up stands before that.
+        told = [guess(f"192.0.2.{n}, 198.51.100.7") for n in range(5)]
+        assert told == ([401] * 3 + [429] * 2 if trusted else [429] * 5)
+
+
+def test_a_proxy_that_is_no_address_is_a_sentence():
+    with pytest.raises(InputError, match="trusted_proxies"):
+        make_config({"data": "x", "trusted_proxies": ["localhost"]})
+
+
+@pytest.mark.parametrize(
+    ("host", "counted"),
+    [
+        ("192.0.2.1", "192.0.2.1"),
+        ("::ffff:192.0.2.1", "192.0.2.1"),
+        ("2001:db8::1", "2001:db8::/64"),
+        ("2001:db8::ffff:1", "2001:db8::/64"),
+        ("", ""),
+    ],
+)
+def test_what_counts_as_one_address(host, counted):
+    assert network_of(host) == counted
 
 
 def test_the_client_waits_as_long_as_it_is_told(start):

@@ -7,6 +7,7 @@ from kiln_schemas.errors import AuthError
 from kiln_service import sessions
 from kiln_service.api.common import PartsHere
 from kiln_service.dashboard.pages import Form, page, read_form, see
+from kiln_service.rates import address_of
 
 router = APIRouter(include_in_schema=False)
 
@@ -31,12 +32,10 @@ async def sign_in(request: Request, parts: PartsHere) -> Response:
     sessions.check_origin(request.headers)
     form = await read_form(request)
     target = _own_path(form.get("next", START))
-    rates, address = request.app.state.rates, request.client.host if request.client else ""
     try:
-        rates.may_sign_in(address)
         value = await sessions.begin(parts.database, parts.tokens, form.get("token", "").strip())
     except AuthError as error:
-        rates.failed(address)
+        await request.app.state.rates.failed(address_of(request))
         return page(request, "login.html", 401, next=target, wrong=error.problem())
     response = see(target)
     response.set_cookie(

@@ -15,14 +15,18 @@ SELECT * FROM tokens ORDER BY name;
 -- Revoke a token.
 DELETE FROM tokens WHERE name = %(name)s RETURNING name;
 
--- name: find_token
--- Whose token has this hash.
-SELECT name, scopes, COALESCE(used < now() - interval '1 minute', true) AS unnoticed FROM tokens
-WHERE sha256 = %(sha256)s;
-
--- name: use_token
--- Note that a token was used.
-UPDATE tokens SET used = now() WHERE sha256 = %(sha256)s;
+-- name: find_tokens
+-- Whose tokens have these hashes; that they were used is noted once a minute.
+WITH found AS (
+    SELECT sha256, name, scopes FROM tokens WHERE sha256 = ANY(%(hashes)s)
+), unnoticed AS (
+    SELECT name FROM tokens
+    WHERE sha256 = ANY(%(hashes)s) AND COALESCE(used < now() - interval '1 minute', true)
+    FOR UPDATE SKIP LOCKED
+), noticed AS (
+    UPDATE tokens SET used = now() FROM unnoticed WHERE tokens.name = unnoticed.name
+)
+SELECT * FROM found;
 
 -- name: add_audit
 -- Record what was done.

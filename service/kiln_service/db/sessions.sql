@@ -8,9 +8,9 @@ WITH over AS (
 INSERT INTO sessions (sha256, token_sha256, expires)
 VALUES (%(sha256)s, %(token_sha256)s, now() + make_interval(secs => %(seconds)s));
 
--- name: find_session
--- The token that a session stands for.
-SELECT token_sha256 FROM sessions WHERE sha256 = %(sha256)s AND expires > now();
+-- name: find_sessions
+-- The tokens that sessions stand for.
+SELECT sha256, token_sha256 FROM sessions WHERE sha256 = ANY(%(hashes)s) AND expires > now();
 
 -- name: delete_session
 -- Someone signed out.
