@@ -62,6 +62,7 @@ def create_app(config: ServiceConfig) -> FastAPI:
 
     app.state.request_seconds = RequestSeconds()
     app.state.rates = RateLimits(config.limits.rates)
+    app.state.readiness = health_routes.Readiness()
     viewer.install(app)
     dashboard.install(app)
     problems.install(app, tokens, config.limits, dashboard.error_page)

@@ -7,6 +7,7 @@ coordinator that starts later. Receivers may be told twice (`X-Lightkiln-Deliver
 """
 
 import asyncio
+import contextlib
 import hashlib
 import hmac
 import ipaddress
@@ -15,6 +16,8 @@ import logging
 import secrets
 import socket
 import time
+from collections import Counter
+from collections.abc import Iterator
 from typing import Final
 
 import httpx
@@ -29,16 +32,20 @@ from kiln_schemas.receivers import is_refused
 from kiln_schemas.text import told
 from kiln_service.config import Timing
 from kiln_service.db import Database, picked
+from kiln_service.events import wait
 from kiln_service.ids import new_id
 from kiln_service.operators import record
 
 log = logging.getLogger(__name__)
 
+AT_ONCE: Final = 64
+"""Deliveries under way in one coordinator,"""
+OF_ONE: Final = 4
+"""and of these to one receiver, so that one that does not answer keeps no other waiting."""
 MAX_ATTEMPTS: Final = 12
 LONGEST_PAUSE_S: Final = 3600.0
 TIMEOUT_S: Final = 10.0
 LEASE_S: Final = 60.0
-AT_ONCE: Final = 16
 
 
 async def add_webhook(database: Database, request: WebhookRequest, actor: str) -> NewWebhook:
@@ -80,28 +87,51 @@ class Deliverer:
 
     def __init__(self, database: Database, timing: Timing) -> None:
         self._database, self._timing = database, timing
+        self._running: Counter[str] = Counter()
+        self._ended = asyncio.Event()
 
     async def run(self) -> None:
         """Until canceled; a database that is away for a while is waited for."""
-        async with httpx.AsyncClient(timeout=TIMEOUT_S, follow_redirects=False) as http:
+        client = httpx.AsyncClient(timeout=TIMEOUT_S, follow_redirects=False)
+        async with client as http, asyncio.TaskGroup() as deliveries:
             while True:
-                taken = 0
-                try:
-                    taken = await self._deliver_due(http)
-                except (psycopg.OperationalError, PoolTimeout) as error:
-                    log.warning("webhooks wait for the database: %s", error)
-                except Exception:
-                    log.exception("a pass of the webhooks failed")
-                if taken < AT_ONCE:
-                    await asyncio.sleep(self._timing.maintenance_s)
+                with self._errors_logged():
+                    for row in await self._take_due():
+                        self._running[row["webhook_id"]] += 1
+                        deliveries.create_task(self._deliver(http, row))
+                await wait(self._ended, self._timing.maintenance_s)
+                self._ended.clear()
 
-    async def _deliver_due(self, http: httpx.AsyncClient) -> int:
+    async def _take_due(self) -> list[DictRow]:
+        """Deliveries that are due, as many as may begin now."""
+        free = AT_ONCE - self._running.total()
+        if not free:
+            return []
+        busy = list(self._running)
         async with self._database.transaction() as tx:
-            rows = await tx.all("take_due_deliveries", lease_s=LEASE_S, limit=AT_ONCE)
-        await asyncio.gather(*(self._deliver(http, row) for row in rows))
-        return len(rows)
+            rows = await tx.all("take_due_deliveries", lease_s=LEASE_S, limit=free, busy=busy, of_one=OF_ONE)
+        return rows
+
+    @contextlib.contextmanager
+    def _errors_logged(self) -> Iterator[None]:
+        try:
+            yield
+        except (psycopg.OperationalError, PoolTimeout) as error:
+            log.warning("webhooks wait for the database: %s", error)
+        except Exception:
+            log.exception("a pass of the webhooks failed")
 
     async def _deliver(self, http: httpx.AsyncClient, row: DictRow) -> None:
+        """One delivery to its end; what goes wrong is logged, and it is tried again when its lease is over."""
+        try:
+            with self._errors_logged():
+                await self._try(http, row)
+        finally:
+            self._running[row["webhook_id"]] -= 1
+            self._running += Counter()  # forgets those with none
+            self._ended.set()
+
+    async def _try(self, http: httpx.AsyncClient, row: DictRow) -> None:
         status, error = await _send(http, row)
         told = status is not None and 200 <= status < 300
         last = row["attempts"] >= MAX_ATTEMPTS

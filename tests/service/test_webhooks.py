@@ -2,7 +2,9 @@
 
 import hashlib
 import hmac
+import ipaddress
 import json
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -10,6 +12,8 @@ from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
+
+from kiln_schemas.receivers import is_refused
 
 
 class Receiver(BaseHTTPRequestHandler):
@@ -86,7 +90,7 @@ def test_nobody_there_is_given_up_after_twelve_attempts(start, fast, receiver, e
     with start(timing=fast) as home:
         hook = home.client.post("/v1/webhooks", json={"url": "http://127.0.0.1:9/"}).json()
         fail_a_job(home)
-        (delivery,) = eventually(lambda: [d for d in deliveries(home, hook) if d["outcome"] == "failed"], 30)
+        (delivery,) = eventually(lambda: [d for d in deliveries(home, hook) if d["outcome"] == "failed"])
         assert delivery["attempts"] == 12 and delivery["status"] is None and delivery["error"]
 
 
@@ -138,6 +142,44 @@ def test_a_name_at_a_refused_address_is_not_called(start, fast, receiver, eventu
         (delivery,) = eventually(lambda: [d for d in deliveries(home, hook) if d["error"]])
         assert "to which nothing is sent" in delivery["error"] and delivery["status"] is None
         assert receiver.told == []
+
+
+def test_a_receiver_that_does_not_answer_keeps_no_other_waiting(start, fast, receiver, eventually, monkeypatch):
+    """Its deliveries would wait for an hour; a healthy receiver that was added after it is told of every event."""
+    monkeypatch.setattr("kiln_service.webhooks.TIMEOUT_S", 3600.0)
+    with start(timing=fast) as home, socket.create_server(("127.0.0.1", 0)) as dead:
+        home.client.post("/v1/webhooks", json={"url": f"http://127.0.0.1:{dead.getsockname()[1]}/"}).raise_for_status()
+        for _ in range(20):
+            fail_a_job(home)
+        add(home, receiver)
+        jobs = [fail_a_job(home) for _ in range(20)]
+        eventually(lambda: {json.loads(body)["job_id"] for _, body in list(receiver.told)} == set(jobs))
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("169.254.169.254", "168.63.129.16", "100.100.100.200", "192.0.0.192", "0.0.0.0", "224.0.0.1"),
+        *("fd00:ec2::254", "fd00:ec2::23", "fd20:ce::254", "fd00:c1::a9fe:a9fe", "fe80::1", "fec0::1", "ff02::1", "::"),
+        *("2002:a9fe:a9fe::", "2002:a83f:8110::1", "64:ff9b::a9fe:a9fe", "64:ff9b:1::168.63.129.16"),
+        *("::ffff:169.254.169.254", "::169.254.169.254", "2001:0:a9fe:a9fe::1", "255.255.255.255"),
+    ],
+)
+def test_no_metadata_service_is_called_however_its_address_is_written(shared, address):
+    assert is_refused(ipaddress.ip_address(address))
+    host = f"[{address}]" if ":" in address else address
+    assert shared.client.post("/v1/webhooks", json={"url": f"http://{host}/"}).status_code == 422
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("127.0.0.1", "::1", "10.0.0.1", "192.168.1.1", "172.16.0.1", "100.64.0.1", "1.1.1.1", "fd12:3456::1"),
+        *("2606:4700::1111", "::ffff:10.0.0.1", "2002:0a00:0001::1", "64:ff9b::1.1.1.1"),
+    ],
+)
+def test_receivers_may_be_in_the_farms_network(address):
+    assert not is_refused(ipaddress.ip_address(address))
 
 
 def test_an_answer_without_an_end_is_not_waited_for(start, fast, receiver, eventually):

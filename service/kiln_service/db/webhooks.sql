@@ -19,15 +19,21 @@ SELECT deliveries.*, events.kind AS event, events.job_id FROM deliveries JOIN ev
 WHERE webhook_id = %(webhook_id)s ORDER BY deliveries.id DESC LIMIT %(limit)s;
 
 -- name: take_due_deliveries
--- Due tellings, taken by one coordinator: no other tries them before the lease is over.
+-- Due tellings, taken by one coordinator: no other tries them before the lease is over. None of webhooks that are busy,
+-- and at most `of_one` of each of the others.
 UPDATE deliveries SET attempts = attempts + 1, due = now() + make_interval(secs => %(lease_s)s)
 FROM webhooks, events
 WHERE deliveries.id IN (
-        SELECT id FROM deliveries WHERE outcome = 'pending' AND due <= now()
-        ORDER BY due LIMIT %(limit)s FOR UPDATE SKIP LOCKED
+        SELECT next.id FROM webhooks CROSS JOIN LATERAL (
+            SELECT id, due FROM deliveries
+            WHERE webhook_id = webhooks.id AND outcome = 'pending' AND due <= now()
+            ORDER BY due LIMIT %(of_one)s FOR UPDATE SKIP LOCKED
+        ) AS next
+        WHERE webhooks.id <> ALL(%(busy)s::text[])
+        ORDER BY next.due LIMIT %(limit)s
     )
   AND webhooks.id = deliveries.webhook_id AND events.id = deliveries.event_id
-RETURNING deliveries.id, deliveries.attempts, webhooks.url, webhooks.secret,
+RETURNING deliveries.id, deliveries.webhook_id, deliveries.attempts, webhooks.url, webhooks.secret,
           events.id AS event_id, events.at, events.job_id, events.kind, events.actor, events.detail;
 
 -- name: end_delivery
