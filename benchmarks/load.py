@@ -70,12 +70,12 @@ class Farm:
 
     async def _work(self, http: httpx.AsyncClient, me: dict[str, Any], claim: dict[str, Any]) -> None:
         """Beat as long as the work takes, then commit, or give it back."""
-        payload, attempt = claim["payload"], claim["attempt"]
+        payload, held = claim["payload"], {"attempt": claim["attempt"], "lease": claim["lease"]}
         task = f"/v1/tasks/{claim['task_id']}"
         left = self._tile_s * self._chance.uniform(0.5, 1.5) * (payload["kind"] == "render")
         while left > 0:
             # As kiln_workers.runner.parent does: at once, then at the interval told.
-            beat = {"task_id": claim["task_id"], "attempt": attempt, "log": "rendering\n"}
+            beat = {"task_id": claim["task_id"], "log": "rendering\n"} | held
             beat |= {"progress": {"done": 1, "total": 2, "unit": "texels"}}
             reply = await self._ask(http, "heartbeat", f"/v1/workers/{me['worker_id']}/heartbeat", beat)
             if reply.json()["stop"]:
@@ -84,10 +84,10 @@ class Farm:
             left -= me["heartbeat_s"]
         if payload["kind"] == "render" and self._chance.random() < RELEASED:
             problem = {"title": "t", "status": 409, "detail": "the worker was stopped", "code": "canceled"}
-            await self._ask(http, "fail", f"{task}/fail", {"attempt": attempt, "problem": problem, "retryable": True})
+            await self._ask(http, "fail", f"{task}/fail", held | {"problem": problem, "retryable": True})
             return
         result = {"kind": payload["kind"], "seconds": 0.5} | await self._result(http, claim)
-        await self._ask(http, f"commit {payload['kind']}", f"{task}/commit", {"attempt": attempt, "result": result})
+        await self._ask(http, f"commit {payload['kind']}", f"{task}/commit", held | {"result": result})
 
     async def _result(self, http: httpx.AsyncClient, claim: dict[str, Any]) -> dict[str, Any]:
         payload = claim["payload"]
@@ -108,7 +108,7 @@ class Farm:
                 return {"tile": payload["tile"], "paths": 10, "overflows": 0, "invalid": 0}
             case "fit":
                 sha256 = await self._put(http, os.urandom(2**16))
-                body = {"attempt": claim["attempt"], "sha256": sha256}
+                body = {"attempt": claim["attempt"], "lease": claim["lease"], "sha256": sha256}
                 await self._ask(http, "checkpoint", f"/v1/tasks/{claim['task_id']}/checkpoint", body)
                 metrics = {"log_mse": 0.1, "log_mse_zero": 1, "log_mse_rel": 0.1, "texels": 10, "signal": True}
                 fit = {"function": payload["function"], "weights": sha256, "exposure": 1, "metrics": metrics}

@@ -244,6 +244,8 @@ class Progress(Contract):
     loss: Real | None = None
 
 
+Lease = Annotated[str, Field(max_length=64, repr=False)]
+"""The secret of an attempt: the claim hands it out, and all that is said of the attempt has to show it."""
 Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$", max_length=63)]
 Tags = Annotated[tuple[Tag, ...], Field(max_length=32)]
 
@@ -272,11 +274,12 @@ class ClaimRequest(Contract):
 
 
 class Claim(Contract):
-    """A task handed to a worker under a fence: every later call carries `attempt`."""
+    """A task handed to a worker under a fence: every later call carries `attempt` and `lease`."""
 
     task_id: Id
     job_id: Id
     attempt: Number
+    lease: Lease
     payload: Payload
     checkpoint: Sha256 | None = None
     """The last checkpoint that an earlier attempt published."""
@@ -285,6 +288,7 @@ class Claim(Contract):
 class Heartbeat(Contract):
     task_id: Id
     attempt: Number
+    lease: Lease = ""
     progress: Progress | None = None
     log: Log = ""
     """Lines written since the last beat."""
@@ -298,11 +302,13 @@ class HeartbeatReply(Contract):
 
 class Commit(Contract):
     attempt: Number
+    lease: Lease = ""
     result: Result
 
 
 class Failure(Contract):
     attempt: Number
+    lease: Lease = ""
     problem: Problem
     retryable: bool
     log: Log = ""
@@ -310,6 +316,7 @@ class Failure(Contract):
 
 class Checkpoint(Contract):
     attempt: Number
+    lease: Lease = ""
     sha256: Sha256
 
 

@@ -15,6 +15,7 @@ from kiln_schemas.errors import InputError
 from kiln_schemas.job import Labels
 from kiln_schemas.operators import Scopes
 from kiln_schemas.tasks import MOST_TILES, Sha256
+from kiln_schemas.text import Line
 
 OWN_TOKEN: Final = "owner"
 """Name of the token in the data folder."""
@@ -40,7 +41,7 @@ Folder = Annotated[Path, Field(json_schema_extra={"maxLength": LONGEST_PATH}), B
 class TokenEntry(Contract):
     """An access token as the coordinator knows it: its hash, never itself."""
 
-    name: str = Field(min_length=1, max_length=64)
+    name: Line = Field(min_length=1, max_length=64)
     sha256: Sha256
     scopes: Scopes
 
@@ -92,6 +93,8 @@ class Limits(Contract):
     """Most jobs on a page."""
     tiles: int = Field(default=MOST_TILES, gt=0, le=MOST_TILES)
     """Most render tiles of a job, and most blocks to refine."""
+    workers: Bound = 4096
+    """Most registered workers of a token; one that is gone makes room for another."""
     rates: Rates = Rates()
     """How often one caller may ask."""
     connections: ConnectionLimits = ConnectionLimits()

@@ -16,7 +16,7 @@ from psycopg_pool import PoolTimeout
 from kiln_service.blobs import Blobs
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, execute
-from kiln_service.reaper import reap
+from kiln_service.reaper import forget_workers, reap
 from kiln_service.retention import apply_rules
 from kiln_service.work import Work
 
@@ -63,6 +63,7 @@ class Maintenance:
         try:
             if may_reap:
                 await reap(self._database, self._work, self._timing.stale_s)
+                await forget_workers(self._database)
             if time.monotonic() >= self._next_collection:
                 self._next_collection = time.monotonic() + self._timing.blob_grace_s / 4
                 await self._blobs.collect(self._timing.blob_grace_s)

@@ -100,7 +100,7 @@ async def unblock_worker(database: Database, worker_id: str, actor: str) -> None
         row = await tx.maybe("find_worker", id=worker_id)
         if row is None:
             raise NotFound(f"no worker '{worker_id}'", where="worker", remedy="GET /v1/workers lists them.")
-        await tx.run("delete_blocks", worker=row["name"])
+        await tx.run("delete_blocks", worker=row["registrant"])
         await record(tx, actor, "worker.unblocked", row["name"], {"worker": worker_id})
 
 

@@ -30,6 +30,7 @@ from kiln_schemas.errors import (
     TooMany,
     Unreachable,
 )
+from kiln_schemas.text import told
 from kiln_service import sessions
 from kiln_service.auth import Principal, TokenBook
 from kiln_service.config import Limits
@@ -118,8 +119,9 @@ async def _invalid_request(request: Request, error: Exception) -> Response:
     first = error.errors()[0]
     place = [str(part) for part in first["loc"]]
     where = ".".join(place[1:] if len(place) > 1 and place[0] == "body" else place)
-    value = repr(first.get("input"))
-    shown = value if len(value) <= 200 else f"{value[:200]}…"
+    value = first.get("input")
+    # Not what the field at fault lies in: it may hold a lease.
+    shown = "it" if isinstance(value, dict | list) else told(repr(value), 200)
     more = f" ({len(error.errors())} faults in all)" if len(error.errors()) > 1 else ""
     return answer(request, InputError(f"{shown} is refused: {first['msg']}{more}", where=where).problem())
 

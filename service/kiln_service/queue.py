@@ -24,7 +24,7 @@ def rank(priority: int, kind: TaskKind) -> int:
 def wanted(worker: WorkerRow, kinds: Collection[TaskKind], stale_s: float) -> dict[str, Any]:
     """What the database's `next_task` goes by; workers not seen for `stale_s` count as gone."""
     asked = [kind.value for kind in kinds]
-    return {"worker": worker.name, "tags": list(worker.tags), "kinds": asked, "stale_s": stale_s}
+    return {"worker": worker.registrant, "tags": list(worker.tags), "kinds": asked, "stale_s": stale_s}
 
 
 async def look(tx: Tx, worker: WorkerRow, kinds: Collection[TaskKind], stale_s: float) -> str | None:

@@ -12,6 +12,7 @@ from kiln_schemas.errors import BakeFailed, Problem
 from kiln_schemas.states import TaskState
 from kiln_service import transitions
 from kiln_service.db import Database, TaskRow, Tx
+from kiln_service.operators import FORGOTTEN_S
 from kiln_service.work import Work, locked_task
 
 log = logging.getLogger(__name__)
@@ -25,6 +26,12 @@ async def reap(database: Database, work: Work, stale_s: float) -> int:
     async with database.transaction() as tx:
         rows = await tx.all("stale_tasks", seconds=stale_s)
     return sum([await _reap_one(database, work, row["id"], stale_s) for row in rows])
+
+
+async def forget_workers(database: Database) -> int:
+    """Forget registrations that were not heard of for so long that lists leave them out; how many."""
+    async with database.transaction() as tx:
+        return await tx.count("forget_workers", forgotten_s=FORGOTTEN_S)
 
 
 async def _reap_one(database: Database, work: Work, task_id: str, stale_s: float) -> int:

@@ -123,7 +123,11 @@ async def release_tasks(tx: Tx, job: JobRow, kind: TaskKind) -> None:
 
 
 async def claim_next(
-    tx: Tx, job_id: str, askers: Sequence[tuple[WorkerRow, Collection[TaskKind]]], stale_s: float
+    tx: Tx,
+    job_id: str,
+    askers: Sequence[tuple[WorkerRow, Collection[TaskKind]]],
+    leases_sha256: Sequence[str],
+    stale_s: float,
 ) -> tuple[JobRow, list[TaskRow | None]]:
     """queued, soft-failed > active under new attempts: the tasks of a job that workers get next; it locks the job.
 
@@ -133,8 +137,15 @@ async def claim_next(
         check_task_move(state, TaskState.ACTIVE)
     locked = await tx.ask("lock_job", id=job_id)
     asked = [
-        await tx.ask("claim_next", job_id=job_id, worker_id=worker.id, **queue.wanted(worker, kinds, stale_s))
-        for worker, kinds in askers
+        await tx.ask(
+            "claim_next",
+            job_id=job_id,
+            worker_id=worker.id,
+            worker_name=worker.name,
+            lease_sha256=lease_sha256,
+            **queue.wanted(worker, kinds, stale_s),
+        )
+        for (worker, kinds), lease_sha256 in zip(askers, leases_sha256, strict=True)
     ]
     row = await locked.fetchone()
     if row is None:

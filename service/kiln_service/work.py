@@ -1,11 +1,14 @@
 """What workers ask: register, claim, heartbeat, commit, fail, checkpoint.
 
-The fence: a claim increments the task's attempt, every later call carries it, and a call whose attempt is not the
-task's running one is refused with StaleAttempt, so that nothing a zombie says counts.
+The fence: a claim increments the task's attempt and hands out a lease, a secret of which the database has the hash.
+Every later call carries both, and one whose attempt is not the task's running one, or whose lease is not that of the
+claim, is refused with StaleAttempt: nothing that a zombie or a stranger says counts.
 Everything that a commit causes (the result, the next stage's release, the job's end) happens in its
 transaction under the job's lock, so the last tile's fan-in happens once.
 """
 
+import hmac
+import secrets
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
@@ -15,7 +18,7 @@ from typing import Final
 from psycopg.types.json import Jsonb
 
 from kiln_schemas import __version__
-from kiln_schemas.errors import Conflict, Drained, InputError, KilnError, NotFound, Problem, StaleAttempt
+from kiln_schemas.errors import Conflict, Drained, InputError, KilnError, NotFound, Problem, StaleAttempt, TooMany
 from kiln_schemas.states import LIVE_JOB_STATES, JobState, TaskState
 from kiln_schemas.tasks import (
     Checkpoint,
@@ -35,6 +38,7 @@ from kiln_schemas.tasks import (
     WorkerRegistration,
 )
 from kiln_service import queue, transitions
+from kiln_service.auth import digest_of
 from kiln_service.batches import Batches
 from kiln_service.blobs import drop_blobs, require_blobs, use_blobs
 from kiln_service.blocks import note_failure
@@ -43,6 +47,7 @@ from kiln_service.db import Database, JobRow, TaskRow, Tx, WorkerRow, fetched
 from kiln_service.events import QUEUED_CHANNEL, Signals, add_event, wait
 from kiln_service.ids import new_id
 from kiln_service.jobs import settle_cancel
+from kiln_service.operators import OFFLINE_S
 from kiln_service.payloads import build_payload
 from kiln_service.planner import METHODS, plan_after_prepare
 from kiln_service.reuse import renders_to_reuse
@@ -59,8 +64,11 @@ class Work:
         self._claims = Batches(database, self._claim_all)
         self._renders = Batches(database, self._commit_renders)
 
-    async def register(self, registration: WorkerRegistration) -> str:
-        """A new worker's id; Conflict where it is of another version than this coordinator."""
+    async def register(self, registration: WorkerRegistration, owner: str) -> str:
+        """The id of a new worker of the token `owner`.
+
+        Conflict where it is of another version than this coordinator, TooMany where the token has too many already.
+        """
         if registration.version != __version__:
             raise Conflict(
                 f"the worker is lightkiln {registration.version}, the coordinator {__version__}",
@@ -69,17 +77,32 @@ class Work:
             )
         worker_id = new_id()
         async with self._database.transaction() as tx:
+            await self._make_room(tx, owner)
             await tx.run(
                 "insert_worker",
                 id=worker_id,
+                owner=owner,
                 **registration.model_dump(exclude={"kinds", "tags"}),
                 kinds=[kind.value for kind in registration.kinds],
                 tags=list(registration.tags),
             )
         return worker_id
 
+    async def _make_room(self, tx: Tx, owner: str) -> None:
+        """TooMany unless the token may register another worker, for which one that is gone makes room."""
+        most = self._config.limits.workers
+        await tx.run("lock_registrations", owner=owner)
+        over = (await tx.one("count_workers", owner=owner))["workers"] + 1 - most
+        if over > 0 and await tx.count("replace_workers", owner=owner, offline_s=OFFLINE_S, count=over) < over:
+            raise TooMany(
+                f"the token '{owner}' has {most} workers registered",
+                where="limits.workers",
+                remedy=f"One that was not heard of for {OFFLINE_S:.0f} s makes room; or raise limits.workers.",
+                wait_s=round(OFFLINE_S),
+            )
+
     async def claim(
-        self, worker_id: str, request: ClaimRequest, is_gone: Callable[[], Awaitable[bool]]
+        self, worker_id: str, request: ClaimRequest, owner: str, is_gone: Callable[[], Awaitable[bool]]
     ) -> Claim | None:
         """The next task of these kinds, waiting for one as long as the worker allows; None where there is none.
 
@@ -92,7 +115,7 @@ class Work:
                 if await is_gone():
                     self._signals.wake(QUEUED_CHANNEL, 1, request.kinds)
                     return None
-                found = await self._claim_once(worker_id, request.kinds)
+                found = await self._claim_once(worker_id, request.kinds, owner)
                 if isinstance(found, Claim):
                     # There may be more: the next one that waits looks.
                     self._signals.wake(QUEUED_CHANNEL, 1, [found.payload.kind])
@@ -103,10 +126,10 @@ class Work:
                 if found is _NOTHING:
                     await wait(woken, min(left, self._signals.claim_poll_s(self._config.timing.poll_s)))
 
-    async def _claim_once(self, worker_id: str, kinds: Sequence[TaskKind]) -> "Claim | _Outcome":
+    async def _claim_once(self, worker_id: str, kinds: Sequence[TaskKind], owner: str) -> "Claim | _Outcome":
         stale_s = self._config.timing.stale_s
         async with self._database.transaction() as tx:
-            worker = await _find_worker(tx, worker_id)
+            worker = await _find_worker(tx, worker_id, owner)
             if worker.orders == "drain":
                 raise Drained("an operator told the worker to leave", where=worker.name)
             rests = worker.orders == "sleep" or worker.asleep
@@ -120,26 +143,37 @@ class Work:
         self, tx: Tx, job_id: str, askers: Sequence[tuple[WorkerRow, Sequence[TaskKind]]]
     ) -> list[Claim | Exception | None]:
         """A task of the job for each worker; None where others have claimed what it saw."""
-        job, tasks = await transitions.claim_next(tx, job_id, askers, self._config.timing.stale_s)
+        leases = [secrets.token_urlsafe(32) for _ in askers]
+        hashes = [digest_of(lease) for lease in leases]
+        job, tasks = await transitions.claim_next(tx, job_id, askers, hashes, self._config.timing.stale_s)
         claims: list[Claim | Exception | None] = []
-        for (worker, _), task in zip(askers, tasks, strict=True):
+        for (worker, _), task, lease in zip(askers, tasks, leases, strict=True):
             if task is None:
                 claims.append(None)
                 continue
             await tx.run("see_worker", id=worker.id)
-            payload, checkpoint = await build_payload(tx, job, task), task.checkpoint
-            claim = Claim(task_id=task.id, job_id=job.id, attempt=task.attempt, payload=payload, checkpoint=checkpoint)
-            claims.append(claim)
+            claims.append(
+                Claim(
+                    task_id=task.id,
+                    job_id=job.id,
+                    attempt=task.attempt,
+                    lease=lease,
+                    payload=await build_payload(tx, job, task),
+                    checkpoint=task.checkpoint,
+                )
+            )
         return claims
 
-    async def heartbeat(self, worker_id: str, beat: Heartbeat) -> HeartbeatReply:
+    async def heartbeat(self, worker_id: str, beat: Heartbeat, owner: str) -> HeartbeatReply:
         """Keep the attempt alive, or tell the worker to stop."""
         progress = beat.progress
         row = await self._database.first(
             "beat",
             worker_id=worker_id,
+            owner=owner,
             task_id=beat.task_id,
             attempt=beat.attempt,
+            lease_sha256=digest_of(beat.lease),
             lines=beat.log,
             progress=Jsonb(progress.model_dump(mode="json")) if progress else None,
             step=progress.done if progress else None,
@@ -165,7 +199,7 @@ class Work:
     async def checkpoint(self, task_id: str, checkpoint: Checkpoint) -> None:
         """Publish a checkpoint for later attempts; the one before is no longer used."""
         async with locked_task(self._database, task_id) as (tx, _, task):
-            _check_fence(task, checkpoint.attempt)
+            _check_fence(task, checkpoint)
             await _require(tx, [checkpoint.sha256])
             await drop_blobs(tx, f"checkpoint:{task.id}")
             await use_blobs(tx, f"checkpoint:{task.id}", [checkpoint.sha256])
@@ -182,7 +216,7 @@ class Work:
         async with locked_task(self._database, task_id) as (tx, job, task):
             if _is_repeated(task, commit):
                 return
-            _check_fence(task, commit.attempt)
+            _check_fence(task, commit)
             _check_result(job, task, commit.result)
             if job.state not in LIVE_JOB_STATES:
                 stopped = StaleAttempt(f"the job is {job.state}; the result is not wanted", where=task.label)
@@ -208,7 +242,7 @@ class Work:
             task = TaskRow.of(await fetched(cursor))
             try:
                 if not _is_repeated(task, commit):
-                    _check_fence(task, commit.attempt)
+                    _check_fence(task, commit)
                     _check_result(job, task, commit.result)
                     await transitions.complete_task(tx, task, commit.result)
                     await tx.run("clear_strikes", id=task.worker_id)
@@ -252,7 +286,7 @@ class Work:
     async def fail(self, task_id: str, failure: Failure) -> None:
         """An attempt ended without a result: another may try, or the task fails."""
         async with locked_task(self._database, task_id) as (tx, job, task):
-            _check_fence(task, failure.attempt)
+            _check_fence(task, failure)
             await _add_log(tx, task.id, failure.attempt, failure.log)
             await self.end_attempt(
                 tx,
@@ -331,9 +365,10 @@ async def _lock(tx: Tx, task_id: str) -> TaskRow:
     return TaskRow.of(await tx.one("lock_task", id=task_id))
 
 
-async def _find_worker(tx: Tx, worker_id: str) -> WorkerRow:
+async def _find_worker(tx: Tx, worker_id: str, owner: str) -> WorkerRow:
+    """The worker, if this token registered it."""
     row = await tx.maybe("find_worker", id=worker_id)
-    if row is None:
+    if row is None or row["owner"] != owner:
         raise _no_worker(worker_id)
     return WorkerRow.of(row)
 
@@ -362,19 +397,26 @@ async def _fan_in(tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
     await transitions.release_tasks(tx, job, stage)
 
 
-def _check_fence(task: TaskRow, attempt: int) -> None:
-    if task.state is not TaskState.ACTIVE or task.attempt != attempt:
+def _check_fence(task: TaskRow, said: Commit | Failure | Checkpoint) -> None:
+    """StaleAttempt unless this is said by who holds the running attempt. It names nobody, and nothing of the task."""
+    if task.state is not TaskState.ACTIVE or not _holds(task, said):
         raise StaleAttempt(
-            f"attempt {attempt} of the task is over: it is {task.state} in attempt {task.attempt}",
-            where=task.label,
+            f"attempt {said.attempt} of the task is over, or the lease is not the one that its claim was given",
+            where="lease",
             remedy="Drop the work and claim again.",
         )
+
+
+def _holds(task: TaskRow, said: Commit | Failure | Checkpoint) -> bool:
+    """Whether this is said under the task's last attempt, with its lease."""
+    right = task.lease_sha256 is not None and hmac.compare_digest(task.lease_sha256, digest_of(said.lease))
+    return right and task.attempt == said.attempt
 
 
 def _is_repeated(task: TaskRow, commit: Commit) -> bool:
     return (
         task.state is TaskState.COMPLETED
-        and task.attempt == commit.attempt
+        and _holds(task, commit)
         and task.result == commit.result.model_dump(mode="json")
     )
 

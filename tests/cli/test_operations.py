@@ -39,11 +39,12 @@ def test_tags_bring_a_job_to_its_workers_and_its_log_is_followed(ask, lightkiln,
     assert farm.post(f"/v1/workers/{plain}/claim", json=body).status_code == 204
     assert ask("change", job, "--tag", "blue")["tags"] == ["blue"]
     claim = farm.post(f"/v1/workers/{tagged}/claim", json=body).json()
-    beat = {"task_id": claim["task_id"], "attempt": 1, "log": "one\ntwo\nthree\n"}
+    held = {"attempt": 1, "lease": claim["lease"]}
+    beat = held | {"task_id": claim["task_id"], "log": "one\ntwo\nthree\n"}
     farm.post(f"/v1/workers/{tagged}/heartbeat", json=beat).raise_for_status()
     assert ask("logs", job, "--tail", "2")[0]["log"] == "two\nthree\n"
     problem = {"title": "t", "status": 422, "detail": "it is no scene", "code": "input"}
-    failure = {"attempt": 1, "problem": problem, "retryable": False}
+    failure = held | {"problem": problem, "retryable": False}
     farm.post(f"/v1/tasks/{claim['task_id']}/fail", json=failure).raise_for_status()
     followed = lightkiln("logs", job, "scene", "-f", "--url", coordinator.url, "--token", coordinator.farm.token)
     assert followed.code == 0 and followed.out.endswith("one\ntwo\nthree\n")

@@ -69,7 +69,10 @@ class Coordinator:
             store_url=instruction,
         )
         name = f"task-{len(self.claims)}-{len(self.calls)}"
-        self.claims.append(Claim(task_id=name, job_id="job", attempt=attempt, payload=payload, checkpoint=checkpoint))
+        claim = Claim(
+            task_id=name, job_id="job", attempt=attempt, lease="secret", payload=payload, checkpoint=checkpoint
+        )
+        self.claims.append(claim)
 
     def put(self, data: bytes) -> str:
         sha256 = hashlib.sha256(data).hexdigest()

@@ -22,9 +22,9 @@ def test_a_result_is_committed_with_its_attempt_and_what_libraries_print_is_log(
     coordinator.add("print", attempt=3)
     worker.step()
     (commit,) = coordinator.named("/commit")
-    assert commit["attempt"] == 3 and commit["result"]["kind"] == "fit"
+    assert (commit["attempt"], commit["lease"]) == (3, "secret") and commit["result"]["kind"] == "fit"
     beats = coordinator.named("/heartbeat")
-    assert {beat["attempt"] for beat in beats} == {3}
+    assert {(beat["attempt"], beat["lease"]) for beat in beats} == {(3, "secret")}
     log = "".join(beat["log"] for beat in beats)
     for line in ("stray words on standard output", "stray bytes on descriptor 1", "a line for the log"):
         assert log.count(line) == 1
@@ -181,7 +181,7 @@ def test_a_node_for_fit_and_refine_runs_both_without_a_renderer(coordinator, wor
         settings=PRESETS["draft"],
         store_url="file:///store",
     )
-    coordinator.claims.append(Claim(task_id="refine", job_id="job", attempt=2, payload=payload))
+    coordinator.claims.append(Claim(task_id="refine", job_id="job", attempt=2, lease="secret", payload=payload))
     worker.step()
     commit = coordinator.named("/v1/tasks/refine/commit")[0]
     assert (commit["attempt"], commit["result"]["kind"], commit["result"]["steps"]) == (2, "refine", 1)

@@ -118,7 +118,7 @@ class FakeWorker:
 
     def __init__(self, coordinator: Coordinator, name: str, **changes: Any) -> None:
         self.home, self.name = coordinator, name
-        registration = {
+        self.registration = {
             "name": name,
             "kinds": ["prepare", "render", "fit", "refine", "package"],
             "memory_bytes": 2**30,
@@ -126,7 +126,7 @@ class FakeWorker:
             "device": "none",
             "version": __version__,
         } | changes
-        welcome = coordinator.client.post("/v1/workers", json=registration).raise_for_status().json()
+        welcome = coordinator.client.post("/v1/workers", json=self.registration).raise_for_status().json()
         self.id = welcome["worker_id"]
 
     def claim(self, *kinds: str, wait_s: float = 0) -> dict[str, Any] | None:
@@ -140,22 +140,22 @@ class FakeWorker:
         return claim
 
     def beat(self, claim: dict[str, Any], log: str = "", progress: dict[str, Any] | None = None) -> dict[str, Any]:
-        body = {"task_id": claim["task_id"], "attempt": claim["attempt"], "log": log, "progress": progress}
+        body = {"task_id": claim["task_id"], "log": log, "progress": progress} | held(claim)
         return self.home.client.post(f"/v1/workers/{self.id}/heartbeat", json=body).raise_for_status().json()
 
     def commit(self, claim: dict[str, Any], result: dict[str, Any]) -> httpx.Response:
-        body = {"attempt": claim["attempt"], "result": result}
+        body = {"result": result} | held(claim)
         return self.home.client.post(f"/v1/tasks/{claim['task_id']}/commit", json=body)
 
     def fail(
         self, claim: dict[str, Any], *, code: str = "internal", status: int = 500, retryable: bool = True, log: str = ""
     ) -> httpx.Response:
         problem = {"title": "t", "status": status, "detail": "it broke", "code": code}
-        body = {"attempt": claim["attempt"], "problem": problem, "retryable": retryable, "log": log}
+        body = {"problem": problem, "retryable": retryable, "log": log} | held(claim)
         return self.home.client.post(f"/v1/tasks/{claim['task_id']}/fail", json=body)
 
     def checkpoint(self, claim: dict[str, Any], data: bytes) -> httpx.Response:
-        body = {"attempt": claim["attempt"], "sha256": self.home.upload(data)}
+        body = {"sha256": self.home.upload(data)} | held(claim)
         return self.home.client.post(f"/v1/tasks/{claim['task_id']}/checkpoint", json=body)
 
     def finish(self, claim: dict[str, Any], **choices: Any) -> None:
@@ -167,6 +167,11 @@ class FakeWorker:
         """Finish tasks until one of the kind `until` is queued."""
         while not self.home.tasks(job_id, kind=until, state="queued"):
             self.finish(self.must_claim(), **choices)
+
+
+def held(claim: dict[str, Any]) -> dict[str, Any]:
+    """What every call of an attempt carries."""
+    return {"attempt": claim["attempt"], "lease": claim["lease"]}
 
 
 def result_of(home: Coordinator, claim: dict[str, Any], tiles: int = 2, **changes: Any) -> dict[str, Any]:
@@ -294,6 +299,11 @@ def eventually() -> Callable[..., Any]:
         return answer
 
     return ask
+
+
+@pytest.fixture
+def make_worker() -> type[FakeWorker]:
+    return FakeWorker
 
 
 @pytest.fixture

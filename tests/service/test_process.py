@@ -88,15 +88,14 @@ def test_kill_and_restart(folder):
     with coordinator(folder) as second:
         assert list((folder / "incoming").iterdir()) == []
         assert second.client.get(f"/v1/blobs/{sha256}").content == b"test"
-        beat = {"task_id": claim["task_id"], "attempt": claim["attempt"]}
+        held = {"attempt": claim["attempt"], "lease": claim["lease"]}
+        beat = {"task_id": claim["task_id"]} | held
         reply = second.client.post(f"/v1/workers/{worker_id}/heartbeat", json=beat)
         assert reply.json() == {"stop": False, "reason": ""}
         result = {"kind": "prepare", "scene": sha256, "texel_map": sha256, "scene_hash": sha256, "seconds": 1}
         result |= {"tiles": [{"row": 0, "column": 0, "size": 8, "texels": 1}], "has_environment": False}
         result |= {"has_light": True, "triangles": 1}
-        commit = second.client.post(
-            f"/v1/tasks/{claim['task_id']}/commit", json={"attempt": claim["attempt"], "result": result}
-        )
+        commit = second.client.post(f"/v1/tasks/{claim['task_id']}/commit", json=held | {"result": result})
         assert commit.status_code == 204
         states = {s["kind"]: s["completed"] for s in second.client.get(f"/v1/jobs/{job['id']}").json()["stages"]}
         assert states == {"prepare": 1, "render": 0, "fit": 0, "refine": 0, "package": 0}

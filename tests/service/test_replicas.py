@@ -114,7 +114,8 @@ class Roamer(threading.Thread):
                     claim = reply.json()
                     path = f"/v1/tasks/{claim['task_id']}/commit"
                     result = self._finish(self, claim)
-                    answer = self.call("POST", path, json={"attempt": claim["attempt"], "result": result})
+                    held = {"attempt": claim["attempt"], "lease": claim["lease"]}
+                    answer = self.call("POST", path, json=held | {"result": result})
                     assert answer.status_code in (204, 409), answer.text
         except BaseException as error:
             self.defects.append(error)

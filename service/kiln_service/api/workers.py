@@ -1,4 +1,9 @@
-"""Routes for workers: register, claim, heartbeat, and the end of a task."""
+"""Routes for workers: register, claim, heartbeat, and the end of a task.
+
+A worker belongs to the token that registered it; an attempt to whoever has the lease that its claim was given.
+"""
+
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request, Response
 
@@ -15,14 +20,18 @@ from kiln_schemas.tasks import (
     WorkerWelcome,
 )
 from kiln_service.api.common import PartsHere, caller, problems
+from kiln_service.auth import Principal
 
-router = APIRouter(prefix="/v1", tags=["workers"], dependencies=[Depends(caller(Scope.WORKER))])
+_worker = caller(Scope.WORKER)
+Worker = Annotated[Principal, Depends(_worker)]
+
+router = APIRouter(prefix="/v1", tags=["workers"], dependencies=[Depends(_worker)])
 
 
 @router.post("/workers", status_code=201, responses=problems(409, 422))
-async def register(registration: WorkerRegistration, parts: PartsHere) -> WorkerWelcome:
-    """Register a worker; its id stays valid when the coordinator restarts."""
-    worker_id = await parts.work.register(registration)
+async def register(registration: WorkerRegistration, parts: PartsHere, who: Worker) -> WorkerWelcome:
+    """Register a worker; its id stays valid when the coordinator restarts, for this token."""
+    worker_id = await parts.work.register(registration, who.name)
     return WorkerWelcome(worker_id=worker_id, heartbeat_s=parts.config.timing.heartbeat_s)
 
 
@@ -31,20 +40,23 @@ async def register(registration: WorkerRegistration, parts: PartsHere) -> Worker
     response_model=Claim,
     responses=problems(404, 409, 422) | {204: {"description": "Nothing to do within `wait_s`"}},
 )
-async def claim(worker_id: str, request: ClaimRequest, parts: PartsHere, http: Request) -> Claim | Response:
+async def claim(
+    worker_id: str, request: ClaimRequest, parts: PartsHere, who: Worker, http: Request
+) -> Claim | Response:
     """Take the next task; held open up to `wait_s` while there is none. 409 `drained`: leave."""
-    return await parts.work.claim(worker_id, request, http.is_disconnected) or Response(status_code=204)
+    found = await parts.work.claim(worker_id, request, who.name, http.is_disconnected)
+    return found or Response(status_code=204)
 
 
 @router.post("/workers/{worker_id}/heartbeat", responses=problems(404, 422))
-async def heartbeat(worker_id: str, beat: Heartbeat, parts: PartsHere) -> HeartbeatReply:
+async def heartbeat(worker_id: str, beat: Heartbeat, parts: PartsHere, who: Worker) -> HeartbeatReply:
     """Say that an attempt lives and how far it is; the answer may be to stop."""
-    return await parts.work.heartbeat(worker_id, beat)
+    return await parts.work.heartbeat(worker_id, beat, who.name)
 
 
 @router.post("/tasks/{task_id}/commit", status_code=204, responses=problems(404, 409, 422))
 async def commit(task_id: str, commit: Commit, parts: PartsHere) -> None:
-    """Hand in the result of an attempt. Repeating the same commit is no error."""
+    """Hand in the result of an attempt. Repeating the same commit is no error. 409 `stale-attempt`: it is not yours."""
     await parts.work.commit(task_id, commit)
 
 

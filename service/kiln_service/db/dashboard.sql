@@ -14,16 +14,16 @@ WHERE job_id = %(job_id)s AND kind = 'render'
 
 -- name: tasks_of_note
 -- Tasks of a job that are single, run, or went wrong; of the many others none.
-SELECT tasks.*, workers.name AS worker
-FROM tasks LEFT JOIN workers ON workers.id = tasks.worker_id
+SELECT tasks.*, CASE WHEN worker_id IS NOT NULL THEN worker_name END AS worker
+FROM tasks
 WHERE job_id = %(job_id)s
   AND (kind NOT IN ('render', 'refine') OR state NOT IN ('waiting', 'queued', 'completed', 'canceled'))
 ORDER BY ordinal LIMIT %(limit)s;
 
 -- name: one_task
 -- A task with its worker's name and its job's state.
-SELECT tasks.*, workers.name AS worker, jobs.state AS job_state
-FROM tasks JOIN jobs ON jobs.id = tasks.job_id LEFT JOIN workers ON workers.id = tasks.worker_id WHERE tasks.id = %(id)s;
+SELECT tasks.*, CASE WHEN worker_id IS NOT NULL THEN worker_name END AS worker, jobs.state AS job_state
+FROM tasks JOIN jobs ON jobs.id = tasks.job_id WHERE tasks.id = %(id)s;
 
 -- name: last_events
 -- The newest events of a job.
@@ -45,12 +45,11 @@ WITH usual AS (
       AND job_id IN (SELECT job_id FROM tasks WHERE state = 'active')
     GROUP BY job_id, kind HAVING count(*) >= 3
 )
-SELECT tasks.id, tasks.job_id, tasks.kind, tasks.label, tasks.attempt, jobs.name AS job, workers.name AS worker,
+SELECT tasks.id, tasks.job_id, tasks.kind, tasks.label, tasks.attempt, jobs.name AS job, tasks.worker_name AS worker,
        extract(epoch FROM now() - tasks.heartbeat)::float8 AS silent_s,
        extract(epoch FROM now() - tasks.started)::float8 AS running_s, usual.seconds::float8 AS usual_s
 FROM tasks
 JOIN jobs ON jobs.id = tasks.job_id
-LEFT JOIN workers ON workers.id = tasks.worker_id
 LEFT JOIN usual ON usual.job_id = tasks.job_id AND usual.kind = tasks.kind
 WHERE tasks.state = 'active'
   AND (tasks.heartbeat < now() - make_interval(secs => %(silent_s)s)

@@ -44,7 +44,7 @@ SELECT workers.*, workers.seen < now() - make_interval(secs => %(offline_s)s) AS
        schedules.days, schedules.begins, schedules.ends, schedules.timezone,
        COALESCE((
            SELECT jsonb_agg(jsonb_build_object('job_id', job_id, 'kind', kind, 'until', until) ORDER BY until DESC)
-           FROM blocks WHERE blocks.worker = workers.name AND until > now()
+           FROM blocks WHERE blocks.worker = workers.registrant AND until > now()
        ), '[]') AS blocks
 FROM workers
 LEFT JOIN schedules ON schedules.worker = workers.name

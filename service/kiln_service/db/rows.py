@@ -92,6 +92,8 @@ class TaskRow(_Row):
     result: dict[str, Any] | None
     progress: Progress | None
     worker_id: str | None
+    lease_sha256: str | None
+    """Of the secret that the last claim handed out."""
     checkpoint: str | None
     error: Problem | None
     created: datetime
@@ -119,6 +121,10 @@ class WorkerRow(_Row):
 
     id: str
     name: str
+    owner: str
+    """Name of the token that registered it."""
+    registrant: str
+    """Owner and name: who it is for blocks and failures, also when it restarts with a new id."""
     kinds: tuple[str, ...]
     tags: tuple[str, ...]
     orders: str

@@ -37,7 +37,8 @@ RETURNING id;
 -- name: claim_next
 -- queued, soft-failed > active: the task of a locked job that a worker gets next; a new attempt begins.
 UPDATE tasks
-SET state = 'active', attempt = tasks.attempt + 1, worker_id = %(worker_id)s, progress = NULL,
+SET state = 'active', attempt = tasks.attempt + 1, worker_id = %(worker_id)s, worker_name = %(worker_name)s,
+    lease_sha256 = %(lease_sha256)s, progress = NULL,
     started = now(), heartbeat = now()
 FROM next_task(%(worker)s, %(tags)s::text[], %(kinds)s::text[], %(job_id)s, %(stale_s)s) AS next
 WHERE tasks.id = next.id

@@ -37,8 +37,8 @@ GROUP BY job_id, kind;
 
 -- name: list_tasks
 -- Tasks of a job in the order of planning, of a kind and in a state where given.
-SELECT tasks.*, workers.name AS worker
-FROM tasks LEFT JOIN workers ON workers.id = tasks.worker_id
+SELECT tasks.*, CASE WHEN worker_id IS NOT NULL THEN worker_name END AS worker
+FROM tasks
 WHERE job_id = %(job_id)s
   AND (%(kind)s::text IS NULL OR kind = %(kind)s) AND (%(state)s::text IS NULL OR state = %(state)s)
 ORDER BY ordinal;

@@ -39,8 +39,8 @@ SELECT count(*) FILTER (WHERE kind = %(kind)s) AS total,
        count(*) FILTER (WHERE kind = %(kind)s AND state = 'completed') AS completed,
        count(*) FILTER (WHERE state IN ('queued', 'soft-failed', 'active')) AS open,
        EXISTS (
-           SELECT FROM takers(%(job_id)s, %(kind)s, %(stale_s)s) AS name
-           WHERE name <> (SELECT workers.name FROM workers WHERE workers.id = %(worker_id)s)
+           SELECT FROM takers(%(job_id)s, %(kind)s, %(stale_s)s) AS registrant
+           WHERE registrant <> (SELECT workers.registrant FROM workers WHERE workers.id = %(worker_id)s)
        ) AS others
 FROM tasks WHERE job_id = %(job_id)s;
 
@@ -68,7 +68,7 @@ SELECT (
         WHERE failures.worker = %(worker)s AND tasks.job_id = jobs.id AND tasks.kind = %(kind)s
     ) AS failed
 ) AS tasks, EXISTS (
-    SELECT FROM takers(%(job_id)s, %(kind)s, %(stale_s)s) AS name WHERE name <> %(worker)s
+    SELECT FROM takers(%(job_id)s, %(kind)s, %(stale_s)s) AS registrant WHERE registrant <> %(worker)s
 ) AS others
 FROM jobs WHERE jobs.id = %(job_id)s;
 
@@ -144,8 +144,31 @@ SELECT pg_notify('kiln_event', job_id) FROM added;
 
 -- name: insert_worker
 -- A worker that registered.
-INSERT INTO workers (id, name, kinds, memory_bytes, threads, device, version, tags)
-VALUES (%(id)s, %(name)s, %(kinds)s, %(memory_bytes)s, %(threads)s, %(device)s, %(version)s, %(tags)s);
+INSERT INTO workers (id, name, owner, kinds, memory_bytes, threads, device, version, tags)
+VALUES (%(id)s, %(name)s, %(owner)s, %(kinds)s, %(memory_bytes)s, %(threads)s, %(device)s, %(version)s, %(tags)s);
+
+-- name: lock_registrations
+-- Let one of several registrations with a token in at a time; held until the transaction ends.
+SELECT pg_advisory_xact_lock(hashtextextended('workers of ' || %(owner)s::text, 0));
+
+-- name: count_workers
+-- Registrations with a token.
+SELECT count(*) AS workers FROM workers WHERE owner = %(owner)s;
+
+-- name: replace_workers
+-- Forget the registrations with a token that nobody has heard of for longest, at most `count`, to make room.
+DELETE FROM workers WHERE id IN (
+    SELECT id FROM workers
+    WHERE owner = %(owner)s AND seen < now() - make_interval(secs => %(offline_s)s)
+      AND NOT EXISTS (SELECT FROM tasks WHERE tasks.worker_id = workers.id AND tasks.state = 'active')
+    ORDER BY seen LIMIT %(count)s
+);
+
+-- name: forget_workers
+-- Forget registrations that nobody has heard of for long; what they did keeps their ids and names.
+DELETE FROM workers
+WHERE seen < now() - make_interval(secs => %(forgotten_s)s)
+  AND NOT EXISTS (SELECT FROM tasks WHERE tasks.worker_id = workers.id AND tasks.state = 'active');
 
 -- name: find_worker
 -- A registered worker, and whether it sleeps by its schedule.
@@ -161,17 +184,19 @@ UPDATE workers SET seen = now() WHERE id = %(id)s AND set_config('synchronous_co
 
 -- name: beat
 -- Keep an attempt alive: its log, its progress and loss (an attempt that begins again from a checkpoint tells the same
--- steps anew), when its worker was seen. `job_state` is NULL where the attempt is not the task's current one. Nothing is
--- harmed if this is lost, so the commit does not wait for the disk.
+-- steps anew), when its worker was seen. `job_state` is NULL where the attempt is not the task's current one, or is not
+-- this worker's: the lease's hashes differ. Nothing is harmed if this is lost, so the commit does not wait for the disk.
 WITH alive AS (
     UPDATE tasks
     SET heartbeat = now(), progress = COALESCE(%(progress)s::jsonb, progress)
     FROM jobs
     WHERE tasks.id = %(task_id)s AND tasks.attempt = %(attempt)s AND tasks.state = 'active' AND jobs.id = tasks.job_id
+      AND tasks.worker_id = %(worker_id)s AND tasks.lease_sha256 = %(lease_sha256)s
+      AND EXISTS (SELECT FROM workers WHERE id = %(worker_id)s AND owner = %(owner)s)
     RETURNING jobs.state AS job_state
 ), said AS (
     INSERT INTO task_logs (task_id, attempt, lines)
-    SELECT tasks.id, %(attempt)s::int, %(lines)s::text FROM tasks WHERE tasks.id = %(task_id)s AND %(lines)s::text <> ''
+    SELECT %(task_id)s::text, %(attempt)s::int, %(lines)s::text FROM alive WHERE %(lines)s::text <> ''
 ), told AS (
     INSERT INTO losses (task_id, step, loss)
     SELECT %(task_id)s::text, %(step)s::double precision, %(loss)s::double precision
@@ -179,7 +204,7 @@ WITH alive AS (
     ON CONFLICT (task_id, step) DO UPDATE SET loss = excluded.loss
 ), seen AS (
     UPDATE workers SET seen = now()
-    WHERE id = %(worker_id)s AND set_config('synchronous_commit', 'off', true) = 'off'
+    WHERE id = %(worker_id)s AND owner = %(owner)s AND set_config('synchronous_commit', 'off', true) = 'off'
     RETURNING id
 )
 SELECT (SELECT job_state FROM alive) AS job_state, EXISTS (SELECT FROM seen) AS known;

@@ -96,8 +96,9 @@ class TaskContext:
         self._report(Progress(done=done, total=total, unit=unit, message=message, loss=loss))
 
     def checkpoint(self, data: bytes) -> None:
+        claim = self._claim
         self._client.checkpoint(
-            self._claim.task_id, Checkpoint(attempt=self._claim.attempt, sha256=self.put_blob(data))
+            claim.task_id, Checkpoint(attempt=claim.attempt, lease=claim.lease, sha256=self.put_blob(data))
         )
 
     def last_checkpoint(self) -> bytes | None:

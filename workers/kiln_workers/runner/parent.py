@@ -218,7 +218,9 @@ class Worker:
         try:
             reply = self._client.heartbeat(
                 welcome.worker_id,
-                Heartbeat(task_id=claim.task_id, attempt=claim.attempt, progress=progress, log=lines),
+                Heartbeat(
+                    task_id=claim.task_id, attempt=claim.attempt, lease=claim.lease, progress=progress, log=lines
+                ),
             )
         except Unreachable:
             self._lines.put_back(lines)
@@ -254,7 +256,7 @@ class Worker:
 
     def _commit(self, claim: Claim, result: Result) -> None:
         try:
-            self._client.commit(claim.task_id, Commit(attempt=claim.attempt, result=result))
+            self._client.commit(claim.task_id, Commit(attempt=claim.attempt, lease=claim.lease, result=result))
         except (StaleAttempt, NotFound) as error:
             self._announce("task.dropped", _names(claim) | {"reason": str(error)})
         except (Unreachable, AuthError, Forbidden):
@@ -279,7 +281,13 @@ class Worker:
 
     def _failure(self, claim: Claim, error: KilnError, retryable: bool) -> Failure:
         tail = "\n".join(self._child.tail) if self._child else ""
-        return Failure(attempt=claim.attempt, problem=error.problem(), retryable=retryable, log=tail[-LOG_CHARACTERS:])
+        return Failure(
+            attempt=claim.attempt,
+            lease=claim.lease,
+            problem=error.problem(),
+            retryable=retryable,
+            log=tail[-LOG_CHARACTERS:],
+        )
 
     def _death(self, ended: Ended) -> KilnError:
         """Why the child ended, with the last lines that it wrote."""
