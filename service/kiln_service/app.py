@@ -27,6 +27,7 @@ from kiln_service.auth import TokenBook, own_token
 from kiln_service.blobs import Blobs
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database
+from kiln_service.db.connection import Timeouts
 from kiln_service.db.migrate import migrate
 from kiln_service.events import Signals
 from kiln_service.maintenance import Maintenance
@@ -94,7 +95,9 @@ async def _lifespan(app: FastAPI, config: ServiceConfig, tokens: TokenBook) -> A
     """Connect, migrate, run the background work; undo it all at the end."""
     if config.database is None:
         raise InputError("no database is configured", where="database", remedy="Start it with `lightkiln serve`.")
-    async with Database(config.database, config.pool_size, config.timing.database_s) as database:
+    timing = config.timing
+    timeouts = Timeouts(timing.statement_s, timing.lock_s, timing.idle_s, timing.transaction_s)
+    async with Database(config.database, config.pool_size, timing.database_s, timeouts) as database:
         await migrate(database)
         signals = Signals(database)
         blobs = Blobs(database, config.blob_base, config.incoming, config.limits)

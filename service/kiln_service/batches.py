@@ -5,7 +5,6 @@ take as many as one of them, so that the more workers ask, the more of them are 
 """
 
 import asyncio
-from collections import defaultdict
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Final, Generic, TypeVar
 
@@ -28,23 +27,31 @@ class Batches(Generic[Q, A]):
 
     def __init__(self, database: Database, serve: Serve[Q, A]) -> None:
         self._database, self._serve = database, serve
-        self._waiting: defaultdict[str, list[tuple[Q, asyncio.Future[A]]]] = defaultdict(list)
+        self._waiting: dict[str, list[tuple[Q, asyncio.Future[A]]]] = {}
+        self._serving: dict[str, asyncio.Task[None]] = {}
 
     async def ask(self, job_id: str, question: Q) -> A:
         """The answer, once the transaction that gave it is committed."""
         answer: asyncio.Future[A] = asyncio.get_running_loop().create_future()
-        self._waiting[job_id].append((question, answer))
+        self._waiting.setdefault(job_id, []).append((question, answer))
+        if job_id not in self._serving:
+            self._serving[job_id] = asyncio.create_task(self._take_turns(job_id), name=f"batches of {job_id}")
+        return await answer
+
+    async def _take_turns(self, job_id: str) -> None:
+        """Answer until nobody asks. A task of its own: whoever asked may hang up while the others wait on."""
         try:
-            async with self._database.turn(job_id):
-                if not answer.done():  # else an earlier turn has taken this question along
-                    waiting = [one for one in self._waiting.pop(job_id) if not one[1].cancelled()]
+            while job_id in self._waiting:
+                async with self._database.turn(job_id):
+                    waiting = [one for one in self._waiting.pop(job_id) if not one[1].done()]
                     if waiting[MOST:]:
                         self._waiting[job_id] = waiting[MOST:]
-                    await self._answer(job_id, waiting[:MOST])
-            return await answer
-        except asyncio.CancelledError:
-            answer.cancel()  # nobody is there any more to answer to
-            raise
+                    if waiting:
+                        await self._answer(job_id, waiting[:MOST])
+        finally:
+            del self._serving[job_id]
+            for _, answer in self._waiting.pop(job_id, ()):  # the coordinator stops
+                answer.cancel()
 
     async def _answer(self, job_id: str, batch: list[tuple[Q, asyncio.Future[A]]]) -> None:
         """All at once; one by one where that fails, so that each gets its own error. Nothing is written twice."""

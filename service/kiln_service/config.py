@@ -111,6 +111,16 @@ class Timing(Contract):
     """Longest sleep of a waiting claim or event stream (a retried job sends no NOTIFY)."""
     database_s: Interval = 15.0
     """A request waits so long for a database connection before it is answered 503."""
+    statement_s: Interval = 60.0
+    """A statement that takes longer is ended by the database."""
+    lock_s: Interval = 30.0
+    """A statement that waits longer for rows that another transaction has locked is ended by the database."""
+    idle_s: Interval = 60.0
+    """A transaction that pauses for longer between two statements is ended by the database."""
+    transaction_s: Interval = 120.0
+    """A transaction that takes longer in all is ended by the coordinator, and the request answered 503."""
+    ready_s: Interval = 5.0
+    """`/readyz` waits so long for a database connection."""
     maintenance_s: Interval = 5.0
     """Between two passes of the reaper."""
     block_s: Interval = 3600.0

@@ -53,7 +53,7 @@ async def free_archived(
 async def _free(database: Database, config: ServiceConfig, job_id: str, *, dry_run: bool) -> Freed | None:
     """One job; None where it is no longer archived."""
     try:
-        async with database.transaction() as tx:
+        async with database.transaction(patient=True) as tx:  # a store is up to tens of GB
             job = await lock_job(tx, job_id)
             if job.state is not JobState.ARCHIVED:
                 return None

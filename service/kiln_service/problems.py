@@ -32,6 +32,7 @@ from kiln_schemas.errors import (
 )
 from kiln_schemas.text import told
 from kiln_service import sessions
+from kiln_service.abandoned import Abandoned
 from kiln_service.auth import Principal, TokenBook
 from kiln_service.config import Limits
 from kiln_service.ids import new_id
@@ -96,8 +97,10 @@ def install(
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(psycopg.OperationalError, _database_away)
     app.add_exception_handler(PoolTimeout, _database_away)
+    app.add_exception_handler(psycopg.errors.IdleInTransactionSessionTimeout, _database_away)
     app.add_exception_handler(psycopg.DataError, _not_storable)
     app.add_exception_handler(ClientDisconnect, _gone)
+    app.add_middleware(Abandoned)
     app.add_middleware(BoundedBody, limit=limits.body_bytes)
     app.add_middleware(Authentication, tokens=tokens)
     app.add_middleware(LastResort)

@@ -33,7 +33,7 @@ async def apply_rules(database: Database, config: ServiceConfig) -> None:
             log.info("freed by the retention rules: %s", ", ".join(freed.stores), extra={"job_id": freed.job_id})
     if rules.log_days is not None:
         states = sorted(FINAL_JOB_STATES)
-        async with database.transaction() as tx:
+        async with database.transaction(patient=True) as tx:
             dropped = await tx.count("drop_logs", states=states, days=rules.log_days, keep=Jsonb(rules.keep))
         if dropped:
             log.info("%d pieces of logs dropped by the retention rules", dropped)

@@ -38,8 +38,7 @@ class Readiness:
 async def _probe(parts: PartsHere) -> Problem | None:
     """Ask the database, then write to the storage."""
     try:
-        async with parts.database.transaction() as tx:
-            await tx.one("ping")
+        await parts.database.ping(parts.config.timing.ready_s)
         await parts.blobs.check()
     except (psycopg.OperationalError, PoolTimeout):
         return Unreachable("the database does not answer", where="database", remedy="Try again soon.").problem()

@@ -6,6 +6,8 @@ so transactions do not deadlock: the worker that asks > the job > its tasks.
 With a thousand workers, how long a job's lock is held bounds how many of its tasks are claimed. So statements are
 pipelined (psycopg's pipeline mode): what is not read is sent together with what comes after it. And who waits for a
 job (`turn`) waits in this process, where the next one goes on at once and no connection is held meanwhile.
+
+Everything here ends: statements, waits for locks, transactions (`Timeouts`), and the wait for a connection.
 """
 
 import asyncio
@@ -16,21 +18,16 @@ from contextlib import asynccontextmanager
 from typing import Any, Final, Self
 
 import psycopg
-from psycopg import AsyncCursor, AsyncPipeline
+from psycopg import AsyncCursor, AsyncPipeline, OperationalError
 from psycopg.rows import DictRow, dict_row
 from psycopg_pool import AsyncConnectionPool
 
 from kiln_schemas.errors import InternalError
+from kiln_service.db.connection import Connection, Timeouts, with_keepalive
 from kiln_service.db.queries import all_queries
 
 FRESH_S: Final = 1.0
 """A connection that worked so short a time ago is used again without asking whether it still does."""
-
-
-class Connection(psycopg.AsyncConnection[DictRow]):
-    """A pooled connection, and when it was last asked whether it works."""
-
-    checked: float = 0.0
 
 
 class Tx:
@@ -82,17 +79,18 @@ class Tx:
 class Database:
     """A pool of connections to one PostgreSQL database."""
 
-    def __init__(self, dsn: str, size: int = 10, patience_s: float = 15.0) -> None:
-        self.dsn = dsn
+    def __init__(self, dsn: str, size: int = 10, patience_s: float = 15.0, timeouts: Timeouts = Timeouts()) -> None:
+        self._dsn, self._timeouts = with_keepalive(dsn), timeouts
         self._turns: weakref.WeakValueDictionary[str, asyncio.Lock] = weakref.WeakValueDictionary()
         self._pool: AsyncConnectionPool[Connection] = AsyncConnectionPool(
-            dsn,
+            self._dsn,
             min_size=2,
             max_size=size,
             timeout=patience_s,
             open=False,
             kwargs={"row_factory": dict_row},
             check=_check,
+            configure=lambda connection: connection.limit(timeouts),
             connection_class=Connection,
         )
 
@@ -104,13 +102,27 @@ class Database:
         await self._pool.close()
 
     @asynccontextmanager
-    async def transaction(self) -> AsyncIterator[Tx]:
-        """Commit at the end of the block, roll back when it raises."""
-        async with self._pool.connection() as connection, connection.pipeline() as pipeline:
+    async def transaction(self, *, patient: bool = False) -> AsyncIterator[Tx]:
+        """Commit at the end of the block, roll back when it raises; OperationalError where it takes too long.
+
+        A `patient` one is background work on many rows, or waits for something outside; only its locks are bounded.
+        """
+        async with (
+            self._pool.connection() as connection,
+            _within(None if patient else self._timeouts.transaction_s, "a transaction"),
+            connection.pipeline() as pipeline,
+        ):
             tx = Tx(connection, pipeline)
+            if patient:
+                await tx.run("be_patient")
             yield tx
             await tx.check_moves()
             await connection.commit()  # together with what was not waited for
+
+    async def ping(self, within_s: float) -> None:
+        """OperationalError unless a connection is to be had and the database answers so soon."""
+        async with _within(within_s, "a connection to the database"), self.transaction() as tx:
+            await tx.one("ping")
 
     def turn(self, job_id: str) -> asyncio.Lock:
         """What transactions that begin by locking this job wait for first; in one coordinator they come in order."""
@@ -118,16 +130,33 @@ class Database:
 
     async def first(self, query: str, **parameters: Any) -> DictRow | None:
         """The first row of one query that is a transaction of its own, or None."""
-        async with self._pool.connection() as connection:
+        async with self._pool.connection() as connection, _within(self._timeouts.transaction_s, "a query"):
             await connection.set_autocommit(True)
             try:
                 return await (await execute(connection, query, **parameters)).fetchone()
             finally:
                 await connection.set_autocommit(False)
 
-    async def dedicated(self) -> psycopg.AsyncConnection[DictRow]:
-        """A connection outside the pool, in autocommit, for LISTEN and session locks; the caller closes it."""
-        return await psycopg.AsyncConnection.connect(self.dsn, autocommit=True, row_factory=dict_row)
+    async def dedicated(self, *, patient: bool = False) -> Connection:
+        """A connection outside the pool, in autocommit, for LISTEN and session locks; the caller closes it.
+
+        A `patient` one is for migrations: they wait for each other and may write every row of a large table.
+        """
+        connection = await Connection.connect(self._dsn, row_factory=dict_row)
+        if not patient:
+            await connection.limit(self._timeouts)
+        await connection.set_autocommit(True)
+        return connection
+
+
+@asynccontextmanager
+async def _within(seconds: float | None, what: str) -> AsyncIterator[None]:
+    """OperationalError where the block takes longer: it is canceled, and its statement with it."""
+    try:
+        async with asyncio.timeout(seconds):
+            yield
+    except TimeoutError as error:
+        raise OperationalError(f"{what} took longer than {seconds:g} s") from error
 
 
 async def fetched(cursor: AsyncCursor[DictRow]) -> DictRow:

@@ -25,7 +25,7 @@ def migrations() -> list[tuple[int, str, str]]:
 async def migrate(database: Database) -> list[str]:
     """Apply what is missing; the names of the migrations applied."""
     # Not a `Tx`: a file of several statements cannot be pipelined.
-    async with await database.dedicated() as connection, connection.transaction():
+    async with await database.dedicated(patient=True) as connection, connection.transaction():
         await execute(connection, "lock_migrations", lock=MIGRATION_LOCK)
         await execute(connection, "make_migrations_table")
         done = {row["version"]: row async for row in await execute(connection, "list_migrations")}

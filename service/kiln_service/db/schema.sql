@@ -21,6 +21,10 @@ SELECT version, sha256 FROM kiln_migrations;
 -- Remember an applied migration.
 INSERT INTO kiln_migrations (version, name, sha256) VALUES (%(version)s, %(name)s, %(sha256)s);
 
+-- name: be_patient
+-- Let the statements of this transaction, and the pauses between them, take as long as they take.
+SELECT set_config('statement_timeout', '0', true), set_config('idle_in_transaction_session_timeout', '0', true);
+
 -- name: ping
 -- Whether the database answers and is migrated.
 SELECT count(*) AS migrations FROM kiln_migrations;
