@@ -5,9 +5,12 @@ exceptions of their code (`kiln_schemas.errors`).
 """
 
 import hashlib
+import os
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from io import BufferedReader
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Literal, Self
@@ -16,7 +19,17 @@ from urllib.parse import quote
 import httpx
 from pydantic import TypeAdapter
 
-from kiln_schemas.errors import AuthError, KilnError, TooMany, Unreachable, error_of_answer, wait_asked
+from kiln_schemas.errors import (
+    AuthError,
+    Damaged,
+    InputError,
+    KilnError,
+    TooMany,
+    Unreachable,
+    error_of_answer,
+    wait_asked,
+)
+from kiln_schemas.files import open_regular
 from kiln_schemas.job import (
     CurveView,
     JobChange,
@@ -93,12 +106,22 @@ class Client:
             found += MissingReply.model_validate_json(reply.content).missing
         return found
 
-    def put_blob(self, sha256: str, path: Path, on_bytes: OnBytes) -> None:
-        """Upload a file; `on_bytes` is told each piece's size."""
-        headers = {"Content-Length": str(path.stat().st_size), "Content-Type": "application/octet-stream"}
-        self._patiently(
-            lambda: self._http.put(f"/v1/blobs/{sha256}", content=_pieces(path, on_bytes), headers=headers, timeout=300)
-        )
+    def put_blob(self, sha256: str, source: Path | Callable[[], BufferedReader], on_bytes: OnBytes) -> None:
+        """Upload a file, which is opened at every try; `on_bytes` is told each piece's size."""
+        open_file = partial(open_regular, source) if isinstance(source, Path) else source
+
+        def attempt() -> httpx.Response:
+            try:
+                file = open_file()
+            except OSError as error:
+                raise InputError(f"cannot be read: {error.strerror}", where=str(error.filename or source)) from None
+            with file:
+                size = os.fstat(file.fileno()).st_size
+                headers = {"Content-Length": str(size), "Content-Type": "application/octet-stream"}
+                pieces = _pieces(file, size, on_bytes)
+                return self._http.put(f"/v1/blobs/{sha256}", content=pieces, headers=headers, timeout=300)
+
+        self._patiently(attempt)
 
     def submit(self, request: JobRequest, key: str | None = None) -> JobView:
         """Submit a job whose files are uploaded; a repetition under the same `key` makes no second job."""
@@ -234,23 +257,39 @@ class Client:
         self._save(f"/v1/blobs/{sha256}", sha256, "the blob", target, lambda _: None)
 
     def _save(self, path: str, sha256: str, name: str, target: Path, on_bytes: OnBytes) -> None:
-        """Stream what lies at `path` into a file."""
+        """Stream what lies at `path` into a file; Damaged where it has another hash, also at a second try."""
+        if self._saved(path, target, on_bytes) == sha256:
+            return
+        # The wire may have damaged it, or a proxy on the way; what is damaged twice is so where it lies.
+        found = self._saved(path, target, lambda _: None)
+        if found != sha256:
+            target.unlink(missing_ok=True)
+            raise Damaged(
+                f"'{name}' arrived damaged, twice: its sha256 is {found} and should be {sha256}",
+                where=self.url,
+                remedy="Check the coordinator's storage; `lightkiln requeue JOB --kind package` makes a package anew.",
+            )
+
+    def _saved(self, path: str, target: Path, on_bytes: OnBytes) -> str:
+        """Stream what lies at `path` into `target`, where no link is followed; the sha256 of what arrived."""
+        digest = hashlib.sha256()
 
         def attempt() -> httpx.Response:
+            nonlocal digest
             digest = hashlib.sha256()
-            with self._http.stream("GET", path) as response, target.open("wb") as file:
+            with self._http.stream("GET", path) as response:
                 if not response.is_success:
                     response.read()
                     return response
-                for chunk in response.iter_bytes(CHUNK):
-                    digest.update(chunk)
-                    file.write(chunk)
-                    on_bytes(len(chunk))
-            if digest.hexdigest() != sha256:
-                raise httpx.ReadError(f"{name} arrived damaged")
+                with open(target, "wb", opener=_without_links) as file:
+                    for chunk in response.iter_bytes(CHUNK):
+                        digest.update(chunk)
+                        file.write(chunk)
+                        on_bytes(len(chunk))
             return response
 
         self._patiently(attempt)
+        return digest.hexdigest()
 
     def _call(
         self,
@@ -299,8 +338,16 @@ class Client:
         return error_of_answer(response.content, response.status_code, asked, self.url)
 
 
-def _pieces(path: Path, on_bytes: OnBytes) -> Iterator[bytes]:
-    with path.open("rb") as file:
-        while chunk := file.read(CHUNK):
-            yield chunk
-            on_bytes(len(chunk))
+def _without_links(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+
+
+def _pieces(file: BufferedReader, size: int, on_bytes: OnBytes) -> Iterator[bytes]:
+    """The first `size` bytes; InputError where the file has shrunk since it was measured."""
+    while size:
+        chunk = file.read(min(CHUNK, size))
+        if not chunk:
+            raise InputError("was changed while it was uploaded", where=str(file.name), remedy="Try again.")
+        size -= len(chunk)
+        yield chunk
+        on_bytes(len(chunk))

@@ -15,12 +15,23 @@ LINE_BREAK: Final = re.compile(r"[\t\n]")
 DETAIL_LENGTH: Final = 4000
 PLACE_LENGTH: Final = 300
 NOTE_LENGTH: Final = 500
+QUOTE_LENGTH: Final = 40
+"""Of a value in a file that an error quotes."""
 
 
 def told(text: str, length: int = DETAIL_LENGTH) -> str:
     r"""At most `length` characters of `text`, and what is not fit to be shown as its escape (`\x1b`)."""
     shown = UNFIT.sub(lambda match: match[0].encode("unicode_escape").decode(), text[: length + 1])
     return shown if len(shown) <= length else f"{shown[: length - 1]}…"
+
+
+def quoted(text: str, length: int = QUOTE_LENGTH) -> str:
+    """A value that a file's author wrote, in quotation marks, at most `length` characters of it, fit to be told.
+
+    For values of attributes, numbers and keywords of JSON and XML, which are cut out of a file whose form was found
+    good. Of formats of lines (OBJ, MTL, PLY), for which any text passes, no message quotes anything: it names the line.
+    """
+    return f"'{told(text, length)}'"
 
 
 def check_line(text: str) -> str:

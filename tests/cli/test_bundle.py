@@ -2,11 +2,16 @@
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from watched_folder import watched
 
 from kiln_schemas.errors import InputError
+from kiln_schemas.files import open_inside
 from kiln_service.cli.bundle import collect
 
 
@@ -150,3 +155,127 @@ def test_other_formats_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.fbx").write_bytes(b"")
     with pytest.raises(InputError, match=r"'\.fbx' is not a scene format.*\.glb"):
         collect(tmp_path / "a.fbx")
+
+
+SECRET = b"root:x:0:0:the secret of somebody else\n"
+
+
+@pytest.fixture
+def shared(tmp_path: Path) -> Path:
+    """A scene's folder beside a file that is none of its author's."""
+    (tmp_path / "secret").write_bytes(SECRET)
+    (tmp_path / "secrets").mkdir()
+    (tmp_path / "secrets" / "a.mtl").write_bytes(b"newmtl a\nmap_Kd wood.png\n")
+    folder = tmp_path / "scene"
+    (folder / "inner").mkdir(parents=True)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["room.ply", "room.obj", "room.gltf", "room.glb", "room.xml"])
+@pytest.mark.parametrize("absolute", [False, True])
+def test_an_entry_that_is_a_link_out_of_its_folder_is_refused(shared: Path, name: str, absolute: bool) -> None:
+    (shared / name).symlink_to(shared.parent / "secret" if absolute else "../secret")
+    with watched(shared.parent) as watch:
+        with pytest.raises(InputError, match="link that leaves the scene's folder") as caught:
+            collect(shared / name)
+        assert not [act for act in watch.acts() if "secret" in act]
+    assert "root:x" not in str(caught.value)
+
+
+def test_an_entry_may_be_a_link_within_its_folder(shared: Path) -> None:
+    (shared / "versions").mkdir()
+    (shared / "versions" / "3.obj").write_text("v 0 0 0\n")
+    (shared / "room.obj").symlink_to("inner/../versions/3.obj")
+    assert files(shared / "room.obj") == {"room.obj": hashlib.sha256(b"v 0 0 0\n").hexdigest()}
+
+
+@pytest.mark.parametrize(
+    ("entry", "text", "link", "target"),
+    [
+        ("a.gltf", '{"images": [{"uri": "i.png"}]}', "i.png", "../secret"),
+        ("a.gltf", '{"buffers": [{"uri": "sub/b.bin"}]}', "sub", "../secrets"),
+        ("a.gltf", '{"buffers": [{"uri": "b.bin"}]}', "b.bin", "inner/../../secret"),
+        ("a.obj", "mtllib a.mtl\n", "a.mtl", "../secrets/a.mtl"),
+        ("a.obj", "mtllib sub/a.mtl\n", "sub", "../secrets"),
+        ("a.xml", '<scene><include filename="b.xml"/></scene>', "b.xml", "../secret"),
+        ("a.xml", '<scene><string name="filename" value="m.ply"/></scene>', "m.ply", "../secret"),
+    ],
+)
+def test_no_reference_follows_a_link_out_of_the_folder(
+    shared: Path, entry: str, text: str, link: str, target: str
+) -> None:
+    (shared / entry).write_text(text)
+    (shared / link).symlink_to(target)
+    (shared.parent / "secrets" / "b.bin").write_bytes(SECRET)
+    with pytest.raises(InputError, match="link that leaves") as caught:
+        collect(shared / entry)
+    assert "root:x" not in str(caught.value)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_an_environment_that_is_a_link_out_of_its_folder_is_refused(shared: Path, inside: bool) -> None:
+    (shared / "a.obj").write_text("v 0 0 0\n")
+    folder = shared if inside else shared.parent / "skies"
+    folder.mkdir(exist_ok=True)
+    (folder / "sky.exr").symlink_to("../secret")
+    with pytest.raises(InputError, match="link that leaves"):
+        collect(shared / "a.obj", folder / "sky.exr")
+
+
+@pytest.mark.parametrize(
+    ("entry", "text", "pipe"),
+    [
+        ("a.obj", "", "a.obj"),
+        ("a.gltf", '{"images": [{"uri": "i.png"}]}', "i.png"),
+        ("a.xml", '<scene><include filename="b.xml"/></scene>', "b.xml"),
+    ],
+)
+def test_a_pipe_is_refused_and_not_waited_for(shared: Path, entry: str, text: str, pipe: str) -> None:
+    (shared / entry).write_text(text)
+    (shared / pipe).unlink(missing_ok=True)
+    os.mkfifo(shared / pipe)
+    with pytest.raises(InputError, match="not a regular file"):
+        collect(shared / entry)
+
+
+def test_a_mitsuba_scene_brings_what_it_includes(shared: Path) -> None:
+    (shared / "a.xml").write_text(
+        '<scene><default name="part" value="inner"/>'
+        '<include filename="$part/b.xml"/><include filename="a.xml"/></scene>'
+    )
+    (shared / "inner" / "b.xml").write_text('<scene><string name="filename" value="m.ply"/></scene>')
+    (shared / "inner" / "m.ply").write_bytes(b"ply")
+    assert set(files(shared / "a.xml")) == {"a.xml", "inner/b.xml", "inner/m.ply"}
+
+
+def test_a_file_that_becomes_a_link_after_it_was_collected_is_not_uploaded(shared: Path) -> None:
+    (shared / "a.obj").write_text("v 0 0 0\n")
+    local = collect(shared / "a.obj")
+    (shared / "a.obj").unlink()
+    (shared / "a.obj").symlink_to("../secret")
+    with pytest.raises(InputError, match="link that leaves"):
+        local.open(local.bundle.files["a.obj"])
+
+
+def test_a_race_for_a_component_never_opens_what_lies_outside(shared: Path) -> None:
+    """Another process exchanges a folder for a link, again and again; what is opened is the folder's or an error."""
+    (shared / "inner" / "secret").write_bytes(b"inside")
+    (shared / "link").symlink_to("..")
+    program = (
+        "import ctypes, os, sys\n"
+        "swap = ctypes.CDLL(None).renameat2\n"
+        "while True:\n"
+        "    swap(-100, b'inner', -100, b'link', 2)\n"  # RENAME_EXCHANGE
+    )
+    opened = refused = 0
+    with subprocess.Popen([sys.executable, "-c", program], cwd=shared) as racer:
+        try:
+            while opened < 500 or refused < 500:
+                try:
+                    with open_inside(shared, "inner/secret") as file:
+                        assert file.read() == b"inside"
+                    opened += 1
+                except OSError:
+                    refused += 1
+        finally:
+            racer.kill()

@@ -1,11 +1,14 @@
 """Collect a scene's files: the entry, what it references, and an environment, as a bundle of hashes.
 
 Only names are read here, with the standard library; whether the files make a scene is the worker's to say. All names
-are relative to the scene's folder and must stay inside it, links included, because the bundle is laid out the same way
-on the worker. An environment may lie anywhere; from outside the folder it is added as `environment/<name>`.
+are relative to the scene's folder and must stay inside it, links included (`kiln_schemas.files`), because the bundle is
+laid out the same way on the worker, and because a scene's folder may be a stranger's, with links to what is not his. So
+the entry too may be a link inside its folder only. An environment may lie anywhere; from outside the folder it is added
+as `environment/<name>`, and its folder bounds its links.
 """
 
 import hashlib
+import io
 import json
 import posixpath
 import re
@@ -13,6 +16,7 @@ import struct
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote
@@ -20,10 +24,13 @@ from urllib.parse import unquote
 from pydantic import ValidationError
 
 from kiln_schemas.errors import InputError
+from kiln_schemas.files import LeavesFolder, NotRegular, is_inside, open_inside
 from kiln_schemas.job import check_bundle, check_bundle_path
 from kiln_schemas.tasks import Bundle, EnvironmentRef
+from kiln_schemas.text import told
 
-CHUNK: Final = 1 << 20
+MAX_INCLUDES: Final = 64
+"""XML files that one scene includes, as many as the worker reads."""
 GLB_MAGIC: Final = b"glTF"
 GLB_JSON: Final = b"JSON"
 MTL_OPTION_VALUES: Final[Mapping[str, int]] = {
@@ -46,68 +53,89 @@ class LocalBundle:
     """A bundle and where its files are on this machine."""
 
     bundle: Bundle
-    sources: Mapping[str, Path]
-    """Bundle path to file."""
+    places: Mapping[str, tuple[Path, str]]
+    """Bundle path to a folder and the file's name in it, which `open_inside` opens."""
+
+    @property
+    def sources(self) -> dict[str, Path]:
+        """Bundle path to file."""
+        return {path: folder / name for path, (folder, name) in self.places.items()}
 
     def by_hash(self) -> dict[str, Path]:
         """One file for each distinct content."""
         return {sha256: self.sources[path] for path, sha256 in self.bundle.files.items()}
+
+    def open(self, sha256: str) -> BufferedReader:
+        """The file of this content, opened as it was when it was collected: no link leads out of its folder."""
+        path = next(path for path, digest in self.bundle.files.items() if digest == sha256)
+        return _open(*self.places[path], path)
 
 
 def collect(
     scene: Path, environment: Path | None = None, *, scale: float = 1.0, rotation_deg: float = 0.0
 ) -> LocalBundle:
     """The bundle of `scene`; InputError names what is missing or leaves the folder, and who references it."""
-    if not scene.is_file():
-        raise InputError("there is no such scene file", where=str(scene), remedy="Check the path.")
     reader = READERS.get(scene.suffix.lower())
+    if not scene.exists():
+        raise InputError("there is no such scene file", where=str(scene), remedy="Check the path.")
     if reader is None:
         known = ", ".join(READERS)
         raise InputError(f"'{scene.suffix}' is not a scene format", where=str(scene), remedy=f"Known: {known}.")
-    folder = scene.resolve().parent
-    sources = {check_bundle_path(scene.name): scene}
-    for name, referrer in reader(folder, scene.name):
-        sources[name] = _inside(folder, name, referrer)
+    folder = scene.parent.resolve()
+    entry = check_bundle_path(scene.name)
+    places, referrers = {entry: (folder, entry)}, {entry: str(scene)}
+    _open(folder, entry, str(scene)).close()
+    for name, referrer in reader(folder, entry):
+        places[name], referrers[name] = (folder, name), referrer
     reference = None
     if environment is not None:
-        name = _environment_name(folder, environment)
-        sources[name] = environment
+        name, place = _environment_place(folder, environment)
+        places[name], referrers[name] = place, str(environment)
         reference = _reference(name, scale, rotation_deg)
-    files = {name: sha256_of(path) for name, path in sorted(sources.items())}
-    return LocalBundle(check_bundle(Bundle(entry=scene.name, files=files, environment=reference)), sources)
+    files = {}
+    for name, place in sorted(places.items()):
+        with _open(*place, referrers[name]) as file:
+            files[name] = sha256_of(file, str(place[0] / place[1]))
+    return LocalBundle(check_bundle(Bundle(entry=entry, files=files, environment=reference)), places)
 
 
-def sha256_of(path: Path) -> str:
-    """Hash of a file; InputError where it cannot be read."""
-    digest = hashlib.sha256()
+def sha256_of(file: BufferedReader, where: str) -> str:
+    """Hash of an open file; InputError where it cannot be read."""
     try:
-        with path.open("rb") as file:
-            while chunk := file.read(CHUNK):
-                digest.update(chunk)
+        return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from None
-    return digest.hexdigest()
+        raise InputError(f"cannot be read: {error.strerror}", where=where) from None
 
 
-def _inside(folder: Path, name: str, referrer: str) -> Path:
-    """The existing file of a bundle path, links followed."""
-    path = folder / name
-    if not path.is_file():
-        raise InputError(f"the file '{name}' is missing", where=referrer, remedy="Add it, or remove what uses it.")
-    if not path.resolve().is_relative_to(folder):
-        raise InputError(
-            f"'{name}' is a link that leaves the scene's folder", where=referrer, remedy="Put the file itself there."
-        )
-    return path
+def _open(folder: Path, name: str, referrer: str) -> BufferedReader:
+    """The file `name` below `folder`, links followed as long as they stay there; InputError at who names it."""
+    try:
+        return open_inside(folder, name)
+    except LeavesFolder:
+        detail, remedy = f"'{name}' is a link that leaves the scene's folder", "Put the file itself there."
+    except (FileNotFoundError, NotADirectoryError):
+        detail, remedy = f"the file '{name}' is missing", "Add it, or remove what uses it."
+    except NotRegular as error:
+        detail, remedy = f"'{name}' cannot be read: {error.strerror}", "Put the file itself there."
+    except OSError as error:
+        detail, remedy = f"'{name}' cannot be read: {error.strerror}", "Make it readable, or remove what uses it."
+    raise InputError(detail, where=referrer, remedy=remedy)
 
 
-def _environment_name(folder: Path, environment: Path) -> str:
-    if not environment.is_file():
+def _read(folder: Path, name: str) -> bytes:
+    with _open(folder, name, name) as file:
+        return file.read()
+
+
+def _environment_place(folder: Path, environment: Path) -> tuple[str, tuple[Path, str]]:
+    """An environment's bundle path, and the folder and name by which it is opened."""
+    if not environment.exists():
         raise InputError("there is no such environment file", where=str(environment), remedy="Check --env.")
-    real = environment.resolve()
-    if real.is_relative_to(folder):
-        return check_bundle_path(real.relative_to(folder).as_posix())
-    return check_bundle_path(f"environment/{environment.name}")
+    parent = environment.parent.resolve()
+    if parent.is_relative_to(folder):
+        name = check_bundle_path((parent / environment.name).relative_to(folder).as_posix())
+        return name, (folder, name)
+    return check_bundle_path(f"environment/{environment.name}"), (parent, environment.name)
 
 
 def _reference(name: str, scale: float, rotation_deg: float) -> EnvironmentRef:
@@ -142,7 +170,7 @@ def _nothing(folder: Path, name: str) -> References:
 
 def _gltf(folder: Path, name: str) -> References:
     try:
-        document: Any = json.loads((folder / name).read_bytes())
+        document: Any = json.loads(_read(folder, name))
     except (ValueError, RecursionError):
         raise InputError("is not JSON", where=name, remedy="Export the scene again.") from None
     yield from _gltf_uris(document, name)
@@ -150,7 +178,7 @@ def _gltf(folder: Path, name: str) -> References:
 
 def _glb(folder: Path, name: str) -> References:
     broken = InputError("is not a GLB file", where=name, remedy="Export the scene again.")
-    with (folder / name).open("rb") as file:
+    with _open(folder, name, name) as file:
         head = file.read(20)
         if len(head) < 20 or head[:4] != GLB_MAGIC or head[16:20] != GLB_JSON:
             raise broken
@@ -173,24 +201,25 @@ def _gltf_uris(document: Any, name: str) -> References:
 
 def _obj(folder: Path, name: str) -> References:
     """Material libraries and their maps; a library that is missing is left out, as the reader does, who notes it."""
-    for arguments in _statements(folder / name, {"mtllib"}):
+    for arguments in _statements(folder, name, {"mtllib"}):
         # A name may hold spaces, and a statement may hold several names: the file system decides.
-        for library in [arguments] if (folder / _joined(name, arguments)).is_file() else arguments.split():
+        for library in [arguments] if is_inside(folder, _joined(name, arguments)) else arguments.split():
             path = _joined(name, library)
-            if (folder / path).is_file():
+            if is_inside(folder, path):
+                _open(folder, path, name).close()
                 yield path, name
-                yield from _mtl(_inside(folder, path, name), path)
+                yield from _mtl(folder, path)
 
 
-def _mtl(file: Path, name: str) -> References:
+def _mtl(folder: Path, name: str) -> References:
     keys = {"map_ka", "map_kd", "map_ks", "map_ke", "map_ns", "map_d", "map_bump", "map_pr", "map_pm", "map_ps"}
-    for arguments in _statements(file, keys | {"bump", "disp", "decal", "refl", "norm"}):
+    for arguments in _statements(folder, name, keys | {"bump", "disp", "decal", "refl", "norm"}):
         yield _joined(name, _map_file(arguments)), name
 
 
-def _statements(path: Path, keys: set[str]) -> Iterator[str]:
+def _statements(folder: Path, name: str, keys: set[str]) -> Iterator[str]:
     """Arguments of the statements with one of these keywords, line by line."""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with io.TextIOWrapper(_open(folder, name, name), encoding="utf-8", errors="replace") as file:
         for line in file:
             key, _, arguments = line.strip().partition(" ")
             if key.lower() in keys and arguments.strip():
@@ -226,15 +255,34 @@ class _Elements(ElementTree.TreeBuilder):
 
 
 def _mitsuba_xml(folder: Path, name: str) -> References:
+    yield from _xml_references(folder, name, {}, [name])
+
+
+def _xml_references(folder: Path, name: str, defaults: dict[str, str], read: list[str]) -> References:
+    """The files that an XML file names, and those of the files that it includes; `read` holds what was included."""
     try:
-        root = ElementTree.fromstring((folder / name).read_bytes(), ElementTree.XMLParser(target=_Elements(name)))
+        root = ElementTree.fromstring(_read(folder, name), ElementTree.XMLParser(target=_Elements(name)))
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two of encodings
-        raise InputError(f"is not XML: {error}", where=name, remedy="Export the scene again.") from None
-    defaults = {node.get("name", ""): node.get("value", "") for node in root.iter("default")}
+        raise InputError(f"is not XML: {told(str(error), 80)}", where=name, remedy="Export the scene again.") from None
+    for node in root.iter("default"):
+        defaults.setdefault(node.get("name", ""), node.get("value", ""))
+
+    def path_of(value: str) -> str:
+        return _joined(name, re.sub(r"\$(\w+)", lambda m: defaults.get(m[1], m[0]), value))
+
     for node in root.iter("string"):
         value = node.get("value")
         if node.get("name") == "filename" and value:
-            yield _joined(name, re.sub(r"\$(\w+)", lambda m: defaults.get(m[1], m[0]), value)), name
+            yield path_of(value), name
+    for node in root.iter("include"):
+        path = path_of(node.get("filename", ""))
+        yield path, name
+        if path not in read:
+            if len(read) > MAX_INCLUDES:
+                raise InputError(f"includes more than {MAX_INCLUDES} files", where=name, remedy="Include fewer.")
+            read.append(path)
+            _open(folder, path, name).close()
+            yield from _xml_references(folder, path, defaults, read)
 
 
 READERS: Final[Mapping[str, Callable[[Path, str], References]]] = {

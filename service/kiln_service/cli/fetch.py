@@ -1,24 +1,47 @@
 """Download a job's package so that a folder with a manifest is always whole.
 
 Files arrive in `DIR.partial`, beside `DIR`, each checked against its hash; then they are moved into `DIR`, the manifest
-last. Files of an older package in `DIR` go first, its manifest before the others.
+last. Files of an older package in `DIR` go first, its manifest before the others. Below `DIR` no link is followed:
+nothing outside of it is written, moved or removed, whatever a manifest names.
 """
 
 import contextlib
-import json
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
+from pydantic import BaseModel
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 
 from kiln_schemas.client import Client
 from kiln_schemas.conventions import MANIFEST_JSON
 from kiln_schemas.errors import DISK_FULL, Conflict, InputError, MachineLacks
+from kiln_schemas.files import LeavesFolder, open_inside, parent_folder, read_small
 from kiln_schemas.job import check_bundle_path
 from kiln_schemas.tasks import Artifact
 from kiln_service.cli.bundle import sha256_of
 from kiln_service.cli.output import notices
+
+
+class _Named(BaseModel):
+    name: str
+
+
+class _Listed(BaseModel):
+    """What has to be known of a package to remove it."""
+
+    files: list[_Named]
+
+
+class _Checked(BaseModel):
+    """What has to be known of a package to verify it."""
+
+    files: list[Artifact]
+
+
+M = TypeVar("M", bound=BaseModel)
 
 
 def download_package(api: Client, job_id: str, out: Path, *, force: bool = False, bar: bool = True) -> list[Path]:
@@ -34,48 +57,74 @@ def download_package(api: Client, job_id: str, out: Path, *, force: bool = False
         check_bundle_path(artifact.name)
     partial = out.with_name(out.name + ".partial")
     with writing(out):
+        partial.mkdir(parents=True, exist_ok=True)
+        if partial.is_symlink():
+            raise InputError("is a link", where=str(partial), remedy="Remove it, or choose another --out.")
         _fetch(api, job_id, artifacts, partial, bar)
+        out.mkdir(parents=True, exist_ok=True)
         remove_package(out)
         for artifact in artifacts:
-            target = out / artifact.name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            (partial / artifact.name).replace(target)
+            with (
+                parent_folder(partial, artifact.name) as (source, name),
+                parent_folder(out, artifact.name, make=True) as (target, _),
+            ):
+                os.replace(name, name, src_dir_fd=source, dst_dir_fd=target)
         shutil.rmtree(partial)
     return [out / artifact.name for artifact in artifacts]
 
 
 def damaged_files(folder: Path) -> tuple[int, list[str]]:
     """How many files a package's manifest names, and those that are missing or differ from it."""
-    path = folder / MANIFEST_JSON
     try:
-        entries = [Artifact.model_validate(entry) for entry in json.loads(path.read_text())["files"]]
-        names = [check_bundle_path(entry.name) for entry in entries]
+        entries = _read(folder, _Checked).files
     except OSError as error:
-        reason = error.strerror or "it cannot be read"
-        raise InputError(reason, where=str(path), remedy="Name the folder of a package.") from None
-    except (ValueError, KeyError, TypeError):
-        raise InputError("this is not a manifest that lightkiln wrote", where=str(path)) from None
-    whole = [
-        (folder / name).is_file() and sha256_of(folder / name) == e.sha256
-        for name, e in zip(names, entries, strict=True)
-    ]
-    return len(names), [name for name, good in zip(names, whole, strict=True) if not good]
+        raise InputError(
+            error.strerror or "it cannot be read",
+            where=str(folder / MANIFEST_JSON),
+            remedy="Name the folder of a package.",
+        ) from None
+    except ValueError:
+        raise InputError("this is not a manifest that lightkiln wrote", where=str(folder / MANIFEST_JSON)) from None
+    return len(entries), [entry.name for entry in entries if not _is_whole(folder, entry)]
 
 
 def remove_package(out: Path) -> None:
-    """Remove the files that the manifest in `out` names, the manifest first; nothing where there is none."""
-    manifest = out / MANIFEST_JSON
-    if not manifest.is_file():
-        return
+    """Remove the files that the manifest in `out` names, the manifest first; nothing where there is none.
+
+    A name that leads through a link is refused before anything is removed: what lies behind it is not the package's.
+    """
     try:
-        names = [check_bundle_path(entry["name"]) for entry in json.loads(manifest.read_text())["files"]]
-    except (ValueError, KeyError, TypeError):
+        names = [check_bundle_path(entry.name) for entry in _read(out, _Listed).files]
+    except FileNotFoundError:
+        return
+    except ValueError:
         raise Conflict(
-            "this is not a manifest that lightkiln wrote", where=str(manifest), remedy="Choose another --out."
+            "this is not a manifest that lightkiln wrote",
+            where=str(out / MANIFEST_JSON),
+            remedy="Choose another --out.",
         ) from None
-    manifest.unlink()
     for name in names:
-        (out / name).unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError), parent_folder(out, name):
+            pass
+    for name in (MANIFEST_JSON, *names):
+        with (
+            contextlib.suppress(FileNotFoundError, NotADirectoryError),
+            parent_folder(out, name) as (parent, last),
+        ):
+            os.unlink(last, dir_fd=parent)
+
+
+def _read(folder: Path, model: type[M]) -> M:
+    """The manifest in `folder` as far as `model` wants it; OSError where there is none, ValueError where it is bad."""
+    return model.model_validate_json(read_small(folder / MANIFEST_JSON))
+
+
+def _is_whole(folder: Path, entry: Artifact) -> bool:
+    try:
+        with open_inside(folder, entry.name) as file:
+            return sha256_of(file, entry.name) == entry.sha256
+    except OSError:
+        return False
 
 
 @contextlib.contextmanager
@@ -86,6 +135,12 @@ def writing(where: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in DISK_FULL:
             raise MachineLacks("the disk is full", where=str(where), remedy="Free space and try again.") from None
+        if isinstance(error, LeavesFolder):
+            raise InputError(
+                f"{error.strerror}, through which nothing is written or removed",
+                where=str(error.filename or where),
+                remedy="Remove the link, or choose another folder.",
+            ) from None
         raise InputError(
             f"cannot be written: {error.strerror}", where=str(error.filename or where), remedy="Choose another folder."
         ) from None
@@ -97,9 +152,9 @@ def _fetch(api: Client, job_id: str, artifacts: Sequence[Artifact], partial: Pat
     with Progress(*columns, console=notices, transient=True, disable=not (bar and notices.is_terminal)) as shown:
         row = shown.add_task("downloading", total=sum(artifact.size for artifact in artifacts))
         for artifact in artifacts:
-            target = partial / artifact.name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if target.is_file() and sha256_of(target) == artifact.sha256:
+            with parent_folder(partial, artifact.name, make=True):
+                pass
+            if _is_whole(partial, artifact):
                 shown.advance(row, artifact.size)
                 continue
-            api.download(job_id, artifact, target, lambda size: shown.advance(row, size))
+            api.download(job_id, artifact, partial / artifact.name, lambda size: shown.advance(row, size))

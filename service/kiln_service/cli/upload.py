@@ -1,5 +1,7 @@
 """Send a bundle: only the files that the coordinator lacks, with a bar, then the job."""
 
+from functools import partial
+from pathlib import Path
 from uuid import uuid4
 
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
@@ -21,7 +23,15 @@ def upload_and_submit(
     missing = api.missing(files)
     columns = (TextColumn("uploading"), BarColumn(), DownloadColumn())
     with Progress(*columns, console=notices, transient=True, disable=not (bar and notices.is_terminal)) as shown:
-        row = shown.add_task("uploading", total=sum(files[sha256].stat().st_size for sha256 in missing))
+        row = shown.add_task("uploading", total=sum(_size(files[sha256]) for sha256 in missing))
         for sha256 in missing:
-            api.put_blob(sha256, files[sha256], lambda size: shown.advance(row, size))
+            api.put_blob(sha256, partial(local.open, sha256), lambda size: shown.advance(row, size))
     return api.submit(request, key or uuid4().hex)
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file for the bar; what is wrong with the file is told when it is opened."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from kiln_schemas import files
 from kiln_schemas.tasks import PreparePayload, PrepareResult
 from kiln_workers.runner.context import Context
 from kiln_workers.stages import prepare
@@ -36,7 +37,7 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     if _seen is None or event not in FILES | OTHERS:
         return
     if event in FILES:
-        folder = Path.cwd()
+        folder = _walked() if event == "open" else Path.cwd()
         if event in ("os.remove", "os.rmdir") and arguments[1] >= 0:  # relative to an open folder
             folder = Path(f"/proc/self/fd/{arguments[1]}").readlink()
         for path in arguments[: 2 if event in ("os.rename", "os.link", "os.symlink") else 1]:
@@ -44,6 +45,14 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
                 _seen.append(f"{event} {folder / os.fsdecode(path)}")
     else:
         _seen.append(f"{event} {arguments[-1 if event == 'socket.connect' else 0]!r}")
+
+
+def _walked() -> Path:
+    """Where a relative name is opened: below the folder that `kiln_schemas.files` has open, which no event tells."""
+    frame = sys._getframe(2)
+    if frame.f_code.co_filename != files.__file__:
+        return Path.cwd()
+    return Path(f"/proc/self/fd/{frame.f_locals['walk'][-1]}").readlink()
 
 
 sys.addaudithook(_hook)

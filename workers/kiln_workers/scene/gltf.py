@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from kiln_schemas.errors import InputError
+from kiln_schemas.text import QUOTE_LENGTH, told
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.geometry import (
     Floats,
@@ -38,6 +39,7 @@ from kiln_workers.scene.gltf_document import (
     pick,
 )
 from kiln_workers.scene.gltf_materials import MaterialTable
+from kiln_workers.scene.limits import NAME_LENGTH
 from kiln_workers.scene.model import LightKind, Mesh, PunctualLight, Scene
 
 READ_EXTENSIONS: Final = frozenset(
@@ -101,17 +103,19 @@ class _Reader:
     def _check_extensions(self) -> None:
         if not self.document.asset.version.startswith("2."):
             raise InputError(
-                f"is glTF {self.document.asset.version}", where=self.entry, remedy="Export it as glTF 2.0."
+                f"is glTF {told(self.document.asset.version, QUOTE_LENGTH)}",
+                where=self.entry,
+                remedy="Export it as glTF 2.0.",
             )
         for name in self.document.extensions_required:
             if name not in READ_EXTENSIONS:
                 raise InputError(
-                    f"requires the extension {name}, which is not read",
+                    f"requires the extension {told(name, NAME_LENGTH)}, which is not read",
                     where=self.entry,
                     remedy="Export it without this extension (uncompressed geometry, PNG or JPEG textures).",
                 )
         for name in sorted(set(self.document.extensions_used) - READ_EXTENSIONS - HARMLESS):
-            self.notes.append(f"'{self.entry}': extension {name} ignored.")
+            self.notes.append(f"'{self.entry}': extension {told(name, NAME_LENGTH)} ignored.")
 
     def _placed_nodes(self) -> list[_Placed]:
         """Nodes of the scene, depth first, each with its world transform; a node reached twice is refused."""

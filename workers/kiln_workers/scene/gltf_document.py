@@ -237,5 +237,5 @@ def pick(items: list[T], index: int, what: str, where: str) -> T:
 
 def _refusal(error: ValidationError, where: str) -> InputError:
     first = error.errors()[0]
-    field = ".".join(str(part) for part in first["loc"]) or "the document"
+    field = told(".".join(str(part) for part in first["loc"]), NAME_LENGTH) or "the document"
     return InputError(f"is not valid glTF 2.0: {field}: {first['msg']}", where=where, remedy="Export it again.")

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from kiln_schemas.errors import InputError
+from kiln_schemas.text import told
 from kiln_workers.scene.gltf_buffers import GltfBuffers
 from kiln_workers.scene.gltf_document import (
     Document,
@@ -23,7 +24,7 @@ from kiln_workers.scene.gltf_document import (
     pick,
 )
 from kiln_workers.scene.images import LOW_RANGE, decode_image
-from kiln_workers.scene.limits import MAX_IMAGE_BYTES
+from kiln_workers.scene.limits import MAX_IMAGE_BYTES, NAME_LENGTH
 from kiln_workers.scene.model import Float32, Image, Material, TextureRef
 
 WRAP: Final = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -91,14 +92,14 @@ class MaterialTable:
         if "KHR_materials_unlit" in part.extensions:
             self.notes.append(f"Material '{name}': unlit; baked as a lit surface of its base colour.")
         for extension in sorted(set(part.extensions) - READ_BY_MATERIALS):
-            self.notes.append(f"Material '{name}': {extension} ignored.")
+            self.notes.append(f"Material '{name}': {told(extension, NAME_LENGTH)} ignored.")
 
     def _texture(self, info: TextureInfo | None, srgb: bool, where: str) -> TextureRef | None:
         if info is None:
             return None
         texture = pick(self.document.textures, info.index, "texture", where)
         if texture.source is None:
-            only = ", ".join(sorted(texture.extensions)) or "nothing"
+            only = told(", ".join(sorted(texture.extensions)), NAME_LENGTH) or "nothing"
             raise InputError(
                 f"texture {info.index} has no PNG or JPEG source ({only} instead)",
                 where=where,

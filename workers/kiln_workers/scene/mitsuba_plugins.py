@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from kiln_schemas.text import quoted
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.geometry import RawMesh
 from kiln_workers.scene.limits import MAX_FILE_BYTES, MAX_TEXT_BYTES
@@ -147,7 +148,9 @@ def _conductor(plugin: Plugin) -> tuple[Material, list[str]]:
     else:
         metal = plugin.text("material", "Cu")
         if metal not in METALS:
-            raise plugin.fail(f"the metal '{metal}' is not known", f"Use one of {', '.join(METALS)}, or eta and k.")
+            raise plugin.fail(
+                f"the metal {quoted(metal)} is not known", f"Use one of {', '.join(METALS)}, or eta and k."
+            )
         facing = np.array(METALS[metal])
     red, green, blue = (float(x) for x in facing * plugin.colour("specular_reflectance", (1.0, 1.0, 1.0)))
     return _material(plugin, (red, green, blue), 1.0, roughness), notes
@@ -163,7 +166,7 @@ def _principled(plugin: Plugin) -> tuple[Material, list[str]]:
         raise plugin.fail("transmission is not baked", "Remove spec_trans.")
     read = {"base_color", "metallic", "roughness", "spec_trans"}
     other = sorted(set(plugin.values) - read)
-    notes = [f"BSDF 'principled': {', '.join(other)} ignored."] if other else []
+    notes = [f"BSDF 'principled': {', '.join(map(quoted, other))} ignored."] if other else []
     metallic, roughness = plugin.number("metallic", 0.0), plugin.number("roughness", 0.5)
     if not (0.0 <= metallic <= 1.0 and 0.0 <= roughness <= 1.0):
         raise plugin.fail("metallic and roughness lie between 0 and 1")

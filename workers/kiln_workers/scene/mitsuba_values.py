@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from kiln_schemas.errors import InputError
+from kiln_schemas.text import quoted
 from kiln_workers.scene.geometry import Floats
 from kiln_workers.scene.limits import check_count
 from kiln_workers.scene.xml_nodes import Node
@@ -38,7 +39,9 @@ class Plugin:
 
     def fail(self, detail: str, remedy: str = "Use one of the plugins and values that lightkiln reads.") -> InputError:
         """An InputError that names this plugin and its line."""
-        return InputError(f"line {self.line}, {self.tag} '{self.kind}': {detail}", where=self.where, remedy=remedy)
+        return InputError(
+            f"line {self.line}, {self.tag} {quoted(self.kind)}: {detail}", where=self.where, remedy=remedy
+        )
 
     def number(self, name: str, default: float) -> float:
         """A float or integer."""
@@ -48,7 +51,7 @@ class Plugin:
         """A boolean."""
         text = self.text(name, "true" if default else "false").lower()
         if text not in ("true", "false"):
-            raise self.fail(f"'{name}' is '{text}', not true or false")
+            raise self.fail(f"'{name}' is {quoted(text)}, not true or false")
         return text == "true"
 
     def text(self, name: str, default: str = "") -> str:
@@ -65,7 +68,7 @@ class Plugin:
             try:
                 encoded = np.array([int(text[i : i + 2], 16) / 255.0 for i in (1, 3, 5)])
             except ValueError:
-                raise self.fail(f"'{name}' is '{text}'") from None
+                raise self.fail(f"'{name}' is {quoted(text)}") from None
             linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
             return float(linear[0]), float(linear[1]), float(linear[2])
         values = self._floats(name, default, (1, 3))
@@ -96,7 +99,9 @@ class Plugin:
             return default
         words = node.attributes.get("value", "").replace(",", " ").split()
         if len(words) not in counts or ":" in "".join(words):
-            raise self.fail(f"'{name}' is '{node.attributes.get('value', '')}'", "Give a number or an rgb colour.")
+            raise self.fail(
+                f"'{name}' is {quoted(node.attributes.get('value', ''))}", "Give a number or an rgb colour."
+            )
         return tuple(_number(word, self) for word in words)
 
 
@@ -104,9 +109,9 @@ def _number(word: str, plugin: Plugin) -> float:
     try:
         value = float(word)
     except ValueError:
-        raise plugin.fail(f"'{word}' is not a number") from None
+        raise plugin.fail(f"{quoted(word)} is not a number") from None
     if not np.isfinite(value):
-        raise plugin.fail(f"'{word}' is not finite")
+        raise plugin.fail(f"{quoted(word)} is not finite")
     return value
 
 
@@ -114,7 +119,7 @@ def _operation(step: Node, plugin: Plugin) -> Floats:
     def triple(text: str) -> Floats:
         words = text.replace(",", " ").split()
         if len(words) != 3:
-            raise plugin.fail(f"'{text}' in a transform is not three numbers")
+            raise plugin.fail(f"{quoted(text)} in a transform is not three numbers")
         return np.array([_number(word, plugin) for word in words])
 
     def axes(default: float) -> Floats:
@@ -145,7 +150,7 @@ def _operation(step: Node, plugin: Plugin) -> Floats:
         left = _unit(np.cross(triple(step.attributes.get("up", "0 1 0")), forward), plugin)
         matrix[:3] = np.stack([left, np.cross(forward, left), forward, origin], axis=1)
     else:
-        raise plugin.fail(f"the transform '{step.tag}' is not read")
+        raise plugin.fail(f"the transform {quoted(step.tag)} is not read")
     return matrix
 
 
@@ -173,7 +178,7 @@ def substituted(node: Node, variables: Mapping[str, str], where: str) -> dict[st
             value = value.replace(f"${name}", variables[name])
         if "$" in value:
             raise InputError(
-                f"line {node.line}: '{value}' names a variable without a default",
+                f"line {node.line}: {quoted(value)} names a variable without a default",
                 where=where,
                 remedy="Add a <default>.",
             )

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from kiln_schemas.errors import InputError
+from kiln_schemas.text import quoted
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.environment import read_environment
 from kiln_workers.scene.geometry import check_mesh_count, check_triangle_count, place, unique_names
@@ -64,7 +65,7 @@ class _Reader:
         where = bundle.origin
         root = parse_xml(bundle.read(Path(where).name, "scene", MAX_TEXT_BYTES), where)
         if root.tag != "scene":
-            raise InputError(f"begins with <{root.tag}>, not with <scene>", where=where)
+            raise InputError(f"begins with {quoted(f'<{root.tag}>')}, not with <scene>", where=where)
         plugins: list[Plugin] = []
         for node in root.children:
             attributes = substituted(node, self.variables, where)
@@ -75,12 +76,15 @@ class _Reader:
                 self.includes += 1
                 check_count(self.includes, MAX_INCLUDES, "included files", where)
                 inner = BundleFolder(bundle.folder, bundle.name(attributes.get("filename", "")))
-                bundle.path(attributes.get("filename", ""), "included file")
+                if not bundle.holds(attributes.get("filename", "")):
+                    raise InputError(f"the included file '{inner.origin}' is missing", where=where, remedy="Add it.")
                 plugins += self._top_level(inner)
             elif node.tag in OBJECT_TAGS:
                 plugins.append(self._plugin(node, bundle))
             elif node.tag not in IGNORED_TAGS and node.tag not in VALUE_TAGS:
-                raise InputError(f"line {node.line}: <{node.tag}> is not read", where=where, remedy="Remove it.")
+                raise InputError(
+                    f"line {node.line}: {quoted(f'<{node.tag}>')} is not read", where=where, remedy="Remove it."
+                )
         return plugins
 
     def _plugin(self, node: Node, bundle: BundleFolder) -> Plugin:
@@ -94,13 +98,13 @@ class _Reader:
             elif child.tag == "ref":
                 target = self.known.get(inner.get("id", ""))
                 if target is None:
-                    raise plugin.fail(f"the reference '{inner.get('id', '')}' names nothing before it")
+                    raise plugin.fail(f"the reference {quoted(inner.get('id', ''))} names nothing before it")
                 plugin.children.append(target)
             elif child.tag in VALUE_TAGS:
                 steps = [Node(s.tag, substituted(s, self.variables, where), s.line) for s in child.children]
                 plugin.values[inner.get("name", "")] = Node(child.tag, inner, child.line, steps)
             else:
-                raise plugin.fail(f"<{child.tag}> is not read")
+                raise plugin.fail(f"{quoted(f'<{child.tag}>')} is not read")
         if "filename" in plugin.values:
             # Hold the name to the bundle now, relative to the file that names it.
             plugin.values["filename"].attributes["value"] = bundle.name(plugin.text("filename"))

@@ -103,7 +103,7 @@ def parse_obj(data: bytes, where: str) -> ObjFile:
                 groups[name, material].corners.extend(fan)
         except (ValueError, IndexError):
             raise InputError(
-                f"line {number} is not understood: '{key} {rest[:60]}'", where=where, remedy="Export it again."
+                f"line {number}: this '{key}' statement is not understood", where=where, remedy="Export it again."
             ) from None
     numbers: dict[str, int] = {}
     for group in groups.values():
@@ -200,8 +200,10 @@ def _read_libraries(
     materials: dict[str, Material] = {}
     for library in dict.fromkeys(name for line in libraries for name in _library_names(line, bundle)):
         name = bundle.name(library)
-        if not (bundle.folder / name).is_file():
-            notes.append(f"'{bundle.origin}': the material library '{library}' is missing; defaults are used.")
+        if not bundle.holds(library):
+            notes.append(
+                f"'{bundle.origin}': the material library '{told(library, NAME_LENGTH)}' is missing; defaults are used."
+            )
             continue
         inner = BundleFolder(bundle.folder, name)
         tables: dict[str, dict[str, str]] = {}
@@ -220,7 +222,7 @@ def _read_libraries(
 
 def _library_names(line: str, bundle: BundleFolder) -> list[str]:
     """The names of an `mtllib` line: one that may hold spaces, or several; the files that there are decide."""
-    return [line] if (bundle.folder / bundle.name(line)).is_file() else line.split()
+    return [line] if bundle.holds(line) else line.split()
 
 
 def _material(title: str, table: dict[str, str], bundle: BundleFolder, textures: _Textures) -> Material:
@@ -233,7 +235,9 @@ def _material(title: str, table: dict[str, str], bundle: BundleFolder, textures:
             values = ()
         if len(values) not in (1, 3) or not np.isfinite(values).all() or min(values) < 0.0:
             raise InputError(
-                f"'{key} {table[key]}' is not understood", where=f"material '{title}'", remedy="Mend the library."
+                f"'{key}' is not one or three numbers of 0 or more",
+                where=f"material '{title}'",
+                remedy="Mend the library.",
             )
         return values * 3 if len(values) == 1 and len(default) == 3 else values
 
@@ -259,4 +263,4 @@ def _map_file(line: str, bundle: BundleFolder) -> str:
         return line
     words = line.split()
     names = [" ".join(words[start:]) for start in range(1, len(words))]
-    return next((name for name in names if (bundle.folder / bundle.name(name)).is_file()), words[-1])
+    return next((name for name in names if bundle.holds(name)), words[-1])

@@ -31,9 +31,9 @@ def parse_ply(data: bytes, where: str, material: int = 0) -> RawMesh:
     try:
         parsed = load_ply(io.BytesIO(data), skip_materials=True)
         faces = np.asarray(triangulate_quads(parsed.get("faces", [])), dtype=np.int64).reshape(-1, 3)
-    except Exception as error:  # trimesh raises whatever its parsing meets, on a file that is not PLY
+    except Exception as error:  # trimesh raises whatever its parsing meets, and quotes it
         raise InputError(
-            f"cannot be read as PLY ({type(error).__name__}: {error})", where=where, remedy="Export it again."
+            f"cannot be read as PLY ({type(error).__name__})", where=where, remedy="Export it again."
         ) from None
     positions = np.asarray(parsed.get("vertices", np.zeros((0, 3))), dtype=np.float64).reshape(-1, 3)
     check_triangle_count(len(faces), where)

@@ -9,6 +9,7 @@ from typing import Final
 from xml.parsers import expat
 
 from kiln_schemas.errors import InputError, TooLarge
+from kiln_schemas.text import told
 from kiln_workers.scene.limits import MAX_ENTRIES
 
 MAX_DEPTH: Final = 32
@@ -53,5 +54,7 @@ def parse_xml(data: bytes, where: str) -> Node:
     try:
         parser.Parse(data, True)
     except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two of encodings
-        raise InputError(f"is not well-formed XML: {error}", where=where, remedy="Mend the file.") from None
+        raise InputError(
+            f"is not well-formed XML: {told(str(error), 80)}", where=where, remedy="Mend the file."
+        ) from None
     return root.children[0]
