@@ -15,13 +15,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Literal, Self
 from urllib.parse import quote
+from urllib.request import getproxies
 
 import httpx
 from pydantic import TypeAdapter
 
 from kiln_schemas.errors import (
     AuthError,
-    Damaged,
+    DamagedDownload,
     InputError,
     KilnError,
     TooMany,
@@ -55,6 +56,7 @@ from kiln_schemas.operators import (
     WebhookView,
     WorkerView,
 )
+from kiln_schemas.proxies import is_loopback
 from kiln_schemas.states import JobState
 from kiln_schemas.tasks import Artifact, TaskKind
 
@@ -78,9 +80,17 @@ class Client:
                 base_url=self.url,
                 headers={"Authorization": f"Bearer {token}"} if token else {},
                 timeout=httpx.Timeout(60.0, connect=5.0),
+                trust_env=not is_loopback(self.url),
             )
+            self._may_be_proxied = not is_loopback(self.url) and bool(getproxies())
         except httpx.InvalidURL as error:
             raise Unreachable(f"this is not a URL: {error}", where=url, remedy="Check --url.") from None
+        except (ValueError, ImportError) as error:  # of a proxy that the environment names
+            raise Unreachable(
+                f"the proxy of the environment cannot be used: {error}",
+                where="HTTP_PROXY, HTTPS_PROXY, ALL_PROXY",
+                remedy="Mend the variable, or name the coordinator's host in NO_PROXY.",
+            ) from None
 
     def __enter__(self) -> Self:
         return self
@@ -257,14 +267,14 @@ class Client:
         self._save(f"/v1/blobs/{sha256}", sha256, "the blob", target, lambda _: None)
 
     def _save(self, path: str, sha256: str, name: str, target: Path, on_bytes: OnBytes) -> None:
-        """Stream what lies at `path` into a file; Damaged where it has another hash, also at a second try."""
+        """Stream what lies at `path` into a file; DamagedDownload where it has another hash, also at a second try."""
         if self._saved(path, target, on_bytes) == sha256:
             return
         # The wire may have damaged it, or a proxy on the way; what is damaged twice is so where it lies.
         found = self._saved(path, target, lambda _: None)
         if found != sha256:
             target.unlink(missing_ok=True)
-            raise Damaged(
+            raise DamagedDownload(
                 f"'{name}' arrived damaged, twice: its sha256 is {found} and should be {sha256}",
                 where=self.url,
                 remedy="Check the coordinator's storage; `lightkiln requeue JOB --kind package` makes a package anew.",
@@ -325,10 +335,11 @@ class Client:
             if time.monotonic() + pause > deadline:
                 if response is not None and response.status_code == TooMany.status:
                     raise self._error(response)
+                proxy = ", and the proxy that the environment names" if self._may_be_proxied else ""
                 raise Unreachable(
                     f"the coordinator does not answer ({reason})",
                     where=self.url,
-                    remedy="Check the URL and whether `lightkiln serve` runs there.",
+                    remedy=f"Check the URL and whether `lightkiln serve` runs there{proxy}.",
                 )
             time.sleep(pause)
             pause = min(2 * pause, PAUSE_S[1])

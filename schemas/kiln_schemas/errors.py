@@ -4,7 +4,7 @@
     |-- InputError          the scene, a file, a field or a setting is wrong (422, exit 3)
     |   |-- TooLarge        a size or count is over its bound (413, exit 3)
     |   |-- Truncated       an upload ended early (400, exit 3)
-    |   `-- Damaged         a file has another hash than it should (422, exit 3)
+    |   `-- DamagedDownload a file arrived with another hash, twice (422, exit 3)
     |-- AuthError           no token, or a wrong one (401, exit 6)
     |-- Forbidden           the token lacks the scope (403, exit 6)
     |-- TooMany             the caller asks too often (429, exit 6)
@@ -107,8 +107,8 @@ class Truncated(InputError):
     code, title, status = "truncated", "The upload ended early", 400
 
 
-class Damaged(InputError):
-    code, title = "damaged", "A file has another hash than it should"
+class DamagedDownload(InputError):
+    code, title = "damaged-download", "A file arrived damaged, again and again"
 
 
 class AuthError(KilnError):

@@ -222,4 +222,7 @@ def make_config(tree: dict[str, Any]) -> ServiceConfig:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "configuration"
-        raise InputError(f"{first.get('input')!r} is refused: {first['msg']}", where=where) from None
+        value = first.get("input")
+        # A wrong value may be a password in the wrong place: numbers alone are quoted.
+        what = f"{value} is refused" if isinstance(value, int | float) else "the value is refused"
+        raise InputError(f"{what}: {first['msg']}", where=where) from None

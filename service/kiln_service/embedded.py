@@ -6,7 +6,10 @@ parent folder to all users. Here the server is a child in its own session (a Ctr
 not reach it), is told by the kernel to stop when the coordinator dies (PR_SET_PDEATHSIG, Linux), listens on
 a Unix socket only, and a server that an earlier coordinator left behind is stopped before the new one
 starts, so there is always exactly one owner. The caller holds the data folder's lock (`serve.py`).
-PostgreSQL refuses to run as root; then it runs as the user `pgserver`, who is made when missing.
+PostgreSQL refuses to run as root; then it runs as the user `pgserver`, who is made when missing. That user may not pass
+the folders above ours (`/root` has mode 0700), and their modes are not ours to change. So the server is started by root
+inside its folder and knows it as /proc/self/cwd, for which it passes no other folder; and programs that it cannot
+reach, as in a virtual environment below /root, it gets as a copy in the temporary folder.
 """
 
 import contextlib
@@ -18,6 +21,7 @@ import os
 import pwd
 import shutil
 import signal
+import stat
 import subprocess
 import sys
 import tempfile
@@ -30,6 +34,7 @@ from typing import Any, Final, Self
 import psycopg
 
 from kiln_schemas.errors import MachineLacks
+from kiln_schemas.redact import SECRET_NAMES
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +45,9 @@ STARTS: Final = 3
 START_PAUSE_S: Final = 1.0
 STOP_TIMEOUT_S: Final = 60.0
 SYSTEM_USER: Final = "pgserver"
+OWN_FOLDER: Final = "/proc/self/cwd"
+"""The folder in which a process runs, whoever may pass the folders above it (proc_pid_cwd(5))."""
+CLUSTER_NAME_MAX: Final = 60
 SOCKET_PATH_MAX: Final = 100
 """Bytes; the kernel's bound for a Unix socket's path is 107."""
 PR_SET_PDEATHSIG: Final = 1
@@ -62,8 +70,10 @@ class EmbeddedPostgres:
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, str] = MappingProxyType({})) -> None:
-        self._settings = {**SERVER_SETTINGS, **settings}
         self.folder = folder.absolute()
+        # How `ps` shows it, of which a machine may run several.
+        name = str(self.folder.parent)[-CLUSTER_NAME_MAX:].encode("ascii", "replace").decode()
+        self._settings = {**SERVER_SETTINGS, "cluster_name": name, **settings}
         self._bin = _binaries(self.folder)
         self._user = _system_user() if os.geteuid() == 0 else None
         self._sockets = _socket_folder(self.folder)
@@ -104,12 +114,13 @@ class EmbeddedPostgres:
     def _launch(self) -> None:
         with self.log_file.open("ab") as output:
             self._process = subprocess.Popen(
-                [str(self._bin / "postgres"), "-D", str(self.folder), "-k", str(self._sockets), *self._flags()],
+                [str(self._bin / "postgres"), "-D", self._seen(self.folder), "-k", self._socket_seen(), *self._flags()],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
                 start_new_session=True,
                 preexec_fn=_stop_with_parent if sys.platform == "linux" else None,
+                cwd=self.folder,
                 **self._identity(),
             )
 
@@ -134,10 +145,19 @@ class EmbeddedPostgres:
         return [part for key, value in self._settings.items() for part in ("-c", f"{key}={value}")]
 
     def _identity(self) -> dict[str, Any]:
-        """Popen arguments that drop root, if we are root."""
+        """Popen arguments that drop root, if we are root, and what is secret in our environment."""
+        kept = {name: value for name, value in os.environ.items() if not SECRET_NAMES.search(name)}
         if self._user is None:
-            return {}
-        return {"user": self._user.pw_uid, "group": self._user.pw_gid, "extra_groups": []}
+            return {"env": kept}
+        return {"env": kept, "user": self._user.pw_uid, "group": self._user.pw_gid, "extra_groups": []}
+
+    def _seen(self, folder: Path) -> str:
+        """The name by which a program of the server's user, started in `folder`, has access to it."""
+        return str(folder) if self._user is None else OWN_FOLDER
+
+    def _socket_seen(self) -> str:
+        """The same of the folder of the socket: the cluster's own, or one in the temporary folder, open to all."""
+        return self._seen(self._sockets) if self._sockets == self.folder else str(self._sockets)
 
     def _make_folders(self) -> None:
         for folder in (self.folder, self._sockets):
@@ -145,8 +165,7 @@ class EmbeddedPostgres:
         if self._user is not None:
             for folder in (self.folder, self._sockets):
                 os.chown(folder, self._user.pw_uid, self._user.pw_gid)
-                _let_pass(folder)
-            _let_pass(self._bin)
+            self._bin = _reachable(self._bin, self._user)
 
     def _make_cluster(self) -> None:
         """Run initdb in a folder beside the final one, so that a killed initdb leaves no half cluster."""
@@ -155,9 +174,14 @@ class EmbeddedPostgres:
         draft.mkdir(mode=0o700)
         if self._user is not None:
             os.chown(draft, self._user.pw_uid, self._user.pw_gid)
-        command = [str(self._bin / "initdb"), "-D", str(draft), "-U", "postgres", "--auth=trust", "--encoding=utf8"]
+        command = [str(self._bin / "initdb"), "-D", self._seen(draft), "-U", "postgres", "--auth=trust"]
         done = subprocess.run(
-            [*command, "--locale=C"], capture_output=True, text=True, start_new_session=True, **self._identity()
+            [*command, "--encoding=utf8", "--locale=C"],
+            capture_output=True,
+            text=True,
+            start_new_session=True,
+            cwd=draft,
+            **self._identity(),
         )
         if done.returncode != 0:
             shutil.rmtree(draft, ignore_errors=True)
@@ -262,13 +286,48 @@ def _socket_folder(folder: Path) -> Path:
     return Path(tempfile.gettempdir()) / f"lightkiln-{os.geteuid()}-{name}"
 
 
-def _let_pass(folder: Path) -> None:
-    """Let other users pass through the parents of `folder` (execute only: they still cannot list them)."""
-    for parent in folder.parents:
-        mode = parent.stat().st_mode
-        if not mode & 0o001:
-            log.info("letting other users pass through %s, for the embedded database", parent)
-            parent.chmod(mode | 0o001)
+def _reachable(programs: Path, user: pwd.struct_passwd) -> Path:
+    """The folder of the programs, or of a copy of them where `user` may not pass the folders above.
+
+    The copy has the layout of the wheel, whose programs find its libraries beside their package. It is root's, in the
+    temporary folder, under a name that tells the installation. One that is not root's alone to write is refused: what
+    is in it would be run.
+    """
+    if _passes(programs, user):
+        return programs
+    install, package = programs.parent, programs.parents[1]
+    stamp = f"{install} {(programs / 'postgres').stat().st_mtime_ns}"
+    name = f"lightkiln-postgres-{hashlib.sha256(os.fsencode(stamp)).hexdigest()[:16]}"
+    copy = Path(tempfile.gettempdir()) / name
+    if not os.path.lexists(copy):
+        draft = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=copy.parent))
+        try:
+            for folder in (install, package.with_name(f"{package.name}.libs")):
+                if folder.is_dir():
+                    shutil.copytree(folder, draft / folder.relative_to(package.parent), symlinks=True)
+            draft.chmod(0o755)
+            with contextlib.suppress(OSError):  # another coordinator was first
+                draft.rename(copy)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+    found = copy.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != 0 or found.st_mode & 0o022 or not _passes(copy, user):
+        raise MachineLacks(
+            f"the user '{user.pw_name}', as whom PostgreSQL runs, cannot reach its programs",
+            where=str(copy),
+            remedy="Remove it, run lightkiln as an ordinary user, or pass --database with a connection string.",
+        )
+    return copy / programs.relative_to(package.parent)
+
+
+def _passes(folder: Path, user: pwd.struct_passwd) -> bool:
+    """Whether `user`, who is in no group but his own, may enter `folder` and all above it."""
+    for place in (folder, *folder.parents):
+        found = place.stat()
+        shift = 6 if found.st_uid == user.pw_uid else 3 if found.st_gid == user.pw_gid else 0
+        if not found.st_mode >> shift & 0o1:
+            return False
+    return True
 
 
 def _stop_with_parent() -> None:

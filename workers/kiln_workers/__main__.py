@@ -10,16 +10,14 @@ import logging
 import os
 import platform
 import re
-import secrets
 import sys
-import tempfile
-import traceback
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from kiln_schemas.errors import AuthError, InputError, InternalError, KilnError, MachineLacks
+from kiln_schemas import program
+from kiln_schemas.errors import AuthError, InputError, KilnError, MachineLacks
 from kiln_schemas.logs import LogFormat, set_up
 from kiln_schemas.tasks import TaskKind, read_tags
 from kiln_workers.compare.arguments import add_compare
@@ -31,14 +29,16 @@ log = logging.getLogger("kiln_workers")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit code."""
+    program.begin()
     options = _parser().parse_args(arguments)
     try:
         code: int = options.command(options)
+        sys.stdout.flush()
         return code
-    except KilnError as error:
-        return _tell(error, options.json)
-    except Exception:
-        return _tell(_defect(), options.json)
+    except BrokenPipeError as error:
+        return program.output_lost(error)
+    except Exception as error:
+        return _tell(program.explained(error), options.json)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -192,20 +192,14 @@ def _print_line(event: str, detail: dict[str, Any]) -> None:
     print(f"{datetime.now():%H:%M:%S} {words}", file=sys.stderr, flush=True)
 
 
-def _defect() -> InternalError:
-    """Write the traceback to a file and name that to the user."""
-    with tempfile.NamedTemporaryFile(
-        "w", prefix=f"lightkiln-defect-{secrets.token_hex(4)}-", suffix=".log", delete=False
-    ) as file:
-        traceback.print_exc(file=file)
-    return InternalError("a defect in lightkiln stopped the worker", remedy=f"Please report it with {file.name}.")
-
-
 def _tell(error: KilnError, as_json: bool) -> int:
-    if as_json:
-        print(json.dumps(error.problem().model_dump()), flush=True)
-    else:
-        print(f"error: {error}", file=sys.stderr)
+    try:
+        if as_json:
+            print(json.dumps(error.problem().model_dump()), flush=True)
+        else:
+            print(f"error: {error}", file=sys.stderr)
+    except OSError as lost:
+        return program.output_lost(lost)
     return error.exit_code
 
 

@@ -24,6 +24,7 @@ from pydantic import ValidationError
 from kiln_schemas.client import Client
 from kiln_schemas.errors import (
     AuthError,
+    Conflict,
     InputError,
     InternalError,
     KilnError,
@@ -39,7 +40,7 @@ WORKER_STOP_S: Final = 8.0
 COORDINATOR_STOP_S: Final = 40.0
 LOCAL_TIMING: Final = {"heartbeat_s": 2.0, "stale_s": 10.0, "maintenance_s": 2.0}
 """Seconds (`kiln_service.config.Timing`). On one machine a lost worker is noticed sooner than on a farm."""
-PERMANENT: Final = frozenset({2, InputError.exit_code, AuthError.exit_code, MachineLacks.exit_code})
+PERMANENT: Final = frozenset({2, InputError.exit_code, Conflict.exit_code, AuthError.exit_code, MachineLacks.exit_code})
 """Exit codes after which a restart would end the same way."""
 TAIL_LINES: Final = 5
 

@@ -17,8 +17,8 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from kiln_schemas import __version__
-from kiln_schemas.errors import DISK_FULL, InputError, KilnError, MachineLacks
+from kiln_schemas import __version__, program
+from kiln_schemas.errors import InputError, KilnError, MachineLacks
 from kiln_schemas.gates import check_gates, read_cameras, read_gates
 from kiln_schemas.job import DEFAULT_PRIORITY, JobRequest, JobView, read_labels
 from kiln_schemas.logs import LogFormat
@@ -36,7 +36,6 @@ from kiln_service.cli.gates import end_of, raise_if_missed, raise_unless_complet
 from kiln_service.cli.jobs import add_job_commands
 from kiln_service.cli.operators import add_operator_commands
 from kiln_service.cli.output import (
-    defect,
     duration,
     notices,
     print_error,
@@ -138,7 +137,10 @@ def serve(
     port: Annotated[int, typer.Option("--port", help="0 takes a free one.")] = 8321,
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
     database: Annotated[
-        str | None, typer.Option("--database", metavar="DSN", help="PostgreSQL; an embedded one by default.")
+        str | None,
+        typer.Option(
+            "--database", envvar="LIGHTKILN_DATABASE", metavar="DSN", help="PostgreSQL; an embedded one by default."
+        ),
     ] = None,
     storage: Annotated[
         str | None,
@@ -152,8 +154,11 @@ def serve(
     json: options.Json = False,
 ) -> None:
     """Run a coordinator."""
+    if database is not None:
+        # By the environment: a connection string may hold a password.
+        os.environ["LIGHTKILN_DATABASE"] = database
     command = ["--host", host, "--port", str(port), "--data", str(data), "--log-format", log_format.value]
-    for flag, value in (("--database", database), ("--storage", storage), ("--store", store), ("--config", config)):
+    for flag, value in (("--storage", storage), ("--store", store), ("--config", config)):
         command += [flag, str(value)] if value is not None else []
     become("kiln_service", [*command, *(["--json"] if json else [])])
 
@@ -417,27 +422,27 @@ add_compare_command(app)
 
 def main() -> NoReturn:
     """Run the command line and exit with the documented code; users see sentences, never tracebacks."""
+    program.begin()
     signal.signal(signal.SIGTERM, _interrupt)
-    as_json = "--json" in sys.argv
     try:
         app()
-    except KilnError as error:
-        _leave(error, as_json=as_json)
+    except SystemExit as error:
+        program.end(error.code if isinstance(error.code, int) else 0)
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
-    except OSError as error:
-        if error.errno in DISK_FULL:
-            full = MachineLacks("the disk is full", where=error.filename, remedy="Free space and try again.")
-            _leave(full, as_json=as_json)
-        _leave(defect(error), as_json=as_json)
+        program.end(INTERRUPTED)
+    except BrokenPipeError as error:
+        sys.exit(program.output_lost(error))
     except Exception as error:
-        _leave(defect(error), as_json=as_json)
-    sys.exit(0)
+        _leave(program.explained(error), as_json="--json" in sys.argv)
+    program.end(0)
 
 
 def _leave(error: KilnError, *, as_json: bool) -> NoReturn:
-    print_error(error, as_json=as_json)
-    sys.exit(error.exit_code)
+    try:
+        print_error(error, as_json=as_json)
+    except OSError as lost:
+        sys.exit(program.output_lost(lost))
+    program.end(error.exit_code)
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:

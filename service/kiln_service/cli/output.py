@@ -4,12 +4,7 @@ Progress and notices go to standard error in both cases, so that standard output
 """
 
 import json
-import secrets
-import sys
-import tempfile
-import traceback
 from collections.abc import Mapping
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from kiln_schemas.base import Contract
-from kiln_schemas.errors import InternalError, KilnError
+from kiln_schemas.errors import KilnError
 from kiln_schemas.job import JobView
 
 notices = Console(stderr=True, highlight=False)
@@ -37,16 +32,6 @@ def print_error(error: KilnError, *, as_json: bool) -> None:
         print_json(error.problem())
     else:
         notices.print(f"[bold red]{escape(str(error))}[/]", soft_wrap=True)
-
-
-def defect(error: BaseException) -> InternalError:
-    """Write the traceback to a file and name that to the user."""
-    with tempfile.NamedTemporaryFile(
-        "w", prefix=f"lightkiln-defect-{secrets.token_hex(4)}-", suffix=".log", delete=False
-    ) as file:
-        file.write(f"{datetime.now().isoformat()} {' '.join(sys.argv)}\n")
-        traceback.print_exception(error, file=file)
-    return InternalError(f"a defect in lightkiln: {type(error).__name__}", remedy=f"Please report it with {file.name}.")
 
 
 def stage_table(job: JobView, wall: Mapping[str, float] | None = None) -> Table:

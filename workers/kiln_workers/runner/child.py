@@ -15,11 +15,13 @@ import shutil
 import sys
 import tempfile
 import threading
+import traceback
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import DISK_FULL, InternalError, KilnError, MachineLacks
+from kiln_schemas.redact import redacted
 from kiln_schemas.tasks import Claim, Progress, Result, TaskKind
 from kiln_workers.runner.blobs import BlobCache
 from kiln_workers.runner.client import CoordinatorClient
@@ -98,7 +100,7 @@ class Child:
     def _defect(self, error: Exception) -> InternalError:
         """Write the traceback to the log under an id and give the id to the user."""
         name = secrets.token_hex(4)
-        log.exception("defect %s", name)
+        log.error("defect %s\n%s", name, redacted(traceback.format_exc(), [self._setup.token]))
         return InternalError(
             f"{type(error).__name__} in a worker (defect {name})",
             remedy="Please report it with the task's log.",

@@ -20,6 +20,7 @@ from kiln_workers.runner.protocol import END_OF_LOG, Done, Failed, Ready, Report
 READER_JOIN_S: Final = 2.0
 LOG_LINES: Final = 200
 """Last lines of the child that go with a failure."""
+TOKEN_VARIABLE: Final = "LIGHTKILN_TOKEN"
 THREAD_VARIABLES: Final = (
     "OMP_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -60,7 +61,10 @@ class ChildProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            env=os.environ | dict.fromkeys(THREAD_VARIABLES, str(setup.threads)) | {"PYTHONUNBUFFERED": "1"},
+            # The token goes by the pipe: no process that the child starts has it.
+            env={name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
+            | dict.fromkeys(THREAD_VARIABLES, str(setup.threads))
+            | {"PYTHONUNBUFFERED": "1"},
             # A Ctrl-C at the terminal is the parent's business.
             start_new_session=True,
         )

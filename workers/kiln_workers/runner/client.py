@@ -21,6 +21,7 @@ import httpx
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import TooMany, Unreachable, error_of_answer, wait_asked
 from kiln_schemas.job import MissingReply
+from kiln_schemas.proxies import is_loopback
 from kiln_schemas.tasks import (
     Checkpoint,
     Claim,
@@ -58,11 +59,19 @@ class CoordinatorClient:
         self._stop = stop or threading.Event()
         self._on_wait = on_wait or (lambda message: None)
         self._patience_s = patience_s
-        self._http = httpx.Client(
-            base_url=self.url,
-            headers={"Authorization": f"Bearer {token}"},
-            timeout=httpx.Timeout(60.0, connect=5.0),
-        )
+        try:
+            self._http = httpx.Client(
+                base_url=self.url,
+                headers={"Authorization": f"Bearer {token}"},
+                timeout=httpx.Timeout(60.0, connect=5.0),
+                trust_env=not is_loopback(self.url),
+            )
+        except (httpx.InvalidURL, ValueError, ImportError) as error:  # the latter two of a proxy in the environment
+            raise Unreachable(
+                f"this URL, or the proxy of the environment, cannot be used: {error}",
+                where=self.url,
+                remedy="Check --url, HTTP_PROXY, HTTPS_PROXY and ALL_PROXY.",
+            ) from None
 
     def __enter__(self) -> Self:
         return self
