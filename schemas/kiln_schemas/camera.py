@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import InputError
+from kiln_schemas.files import read_small
 
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Triple = tuple[Coordinate, Coordinate, Coordinate]
@@ -49,7 +50,7 @@ def read_camera(text: str, where: str | None = None) -> Camera:
         if len(parts) == 3:
             position, target = (tuple(float(x) for x in part.split(",")) for part in parts[:2])
             return Camera.model_validate({"position": position, "target": target, "fov_deg": float(parts[2])})
-        return Camera.model_validate_json(Path(text).read_text(encoding="utf-8"))
+        return Camera.model_validate_json(read_small(Path(text)))
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(x) for x in first["loc"])

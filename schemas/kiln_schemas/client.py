@@ -13,12 +13,12 @@ from functools import partial
 from io import BufferedReader
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal, Self, TypeVar
 from urllib.parse import quote
 from urllib.request import getproxies
 
 import httpx
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from kiln_schemas.errors import (
     AuthError,
@@ -66,6 +66,7 @@ AWAY: Final = frozenset({TooMany.status, 502, 503, 504})
 """Statuses of an answer after which the call is repeated, not before its Retry-After."""
 MISSING_AT_ONCE: Final = 4096
 OnBytes = Callable[[int], None]
+T = TypeVar("T")
 
 
 class Client:
@@ -113,7 +114,7 @@ class Client:
         for start in range(0, len(wanted), MISSING_AT_ONCE):
             body = MissingRequest(sha256=tuple(wanted[start : start + MISSING_AT_ONCE]))
             reply = self._call("POST", "/v1/blobs/missing", json=body.model_dump(mode="json"))
-            found += MissingReply.model_validate_json(reply.content).missing
+            found += self._parsed(MissingReply, reply).missing
         return found
 
     def put_blob(self, sha256: str, source: Path | Callable[[], BufferedReader], on_bytes: OnBytes) -> None:
@@ -137,10 +138,10 @@ class Client:
         """Submit a job whose files are uploaded; a repetition under the same `key` makes no second job."""
         headers = {"Idempotency-Key": key} if key else {}
         reply = self._call("POST", "/v1/jobs", json=request.model_dump(mode="json"), headers=headers)
-        return JobView.model_validate_json(reply.content)
+        return self._parsed(JobView, reply)
 
     def job(self, job_id: str) -> JobView:
-        return JobView.model_validate_json(self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}").content)
+        return self._parsed(JobView, self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}"))
 
     def jobs(
         self, limit: int = 50, *, labels: Sequence[str] = (), text: str | None = None, states: Sequence[JobState] = ()
@@ -149,37 +150,37 @@ class Client:
         params: dict[str, Any] = {"limit": limit, "label": list(labels), "state": [state.value for state in states]}
         if text is not None:
             params["q"] = text
-        return JobPage.model_validate_json(self._call("GET", "/v1/jobs", params=params).content)
+        return self._parsed(JobPage, self._call("GET", "/v1/jobs", params=params))
 
     def tasks(self, job_id: str, kind: TaskKind | None = None) -> tuple[TaskView, ...]:
         """A job's tasks, all or of one kind."""
         params = {} if kind is None else {"kind": kind.value}
         reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/tasks", params=params)
-        return TypeAdapter(tuple[TaskView, ...]).validate_json(reply.content)
+        return self._parsed(tuple[TaskView, ...], reply)
 
     def curves(self, job_id: str) -> tuple[CurveView, ...]:
         """The losses of a job's fits over their steps."""
         reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/curves")
-        return TypeAdapter(tuple[CurveView, ...]).validate_json(reply.content)
+        return self._parsed(tuple[CurveView, ...], reply)
 
     def act(self, job_id: str, action: Literal["pause", "resume", "cancel", "retry", "archive"]) -> JobView:
         """Ask something of a job."""
-        return JobView.model_validate_json(self._call("POST", f"/v1/jobs/{quote(job_id, safe='')}/{action}").content)
+        return self._parsed(JobView, self._call("POST", f"/v1/jobs/{quote(job_id, safe='')}/{action}"))
 
     def requeue(self, job_id: str, wanted: RequeueRequest) -> JobView:
         """Do tasks again that are done, and what follows from them."""
         body = wanted.model_dump(mode="json", exclude_none=True)
         path = f"/v1/jobs/{quote(job_id, safe='')}/requeue"
-        return JobView.model_validate_json(self._call("POST", path, json=body).content)
+        return self._parsed(JobView, self._call("POST", path, json=body))
 
     def change(self, job_id: str, wanted: JobChange) -> JobView:
         """Rank or label a job anew."""
         body = wanted.model_dump(mode="json", exclude_none=True)
-        return JobView.model_validate_json(self._call("PATCH", f"/v1/jobs/{quote(job_id, safe='')}", json=body).content)
+        return self._parsed(JobView, self._call("PATCH", f"/v1/jobs/{quote(job_id, safe='')}", json=body))
 
     def workers(self) -> tuple[WorkerView, ...]:
         """Workers that were seen within a week."""
-        return TypeAdapter(tuple[WorkerView, ...]).validate_json(self._call("GET", "/v1/workers").content)
+        return self._parsed(tuple[WorkerView, ...], self._call("GET", "/v1/workers"))
 
     def order_worker(self, worker_id: str, order: Order) -> None:
         """Tell a worker to sleep, to wake or to leave."""
@@ -199,12 +200,12 @@ class Client:
 
     def tokens(self) -> tuple[TokenView, ...]:
         """Access tokens that were made, without themselves."""
-        return TypeAdapter(tuple[TokenView, ...]).validate_json(self._call("GET", "/v1/tokens").content)
+        return self._parsed(tuple[TokenView, ...], self._call("GET", "/v1/tokens"))
 
     def create_token(self, request: TokenRequest) -> NewToken:
         """Make an access token."""
         reply = self._call("POST", "/v1/tokens", json=request.model_dump(mode="json"))
-        return NewToken.model_validate_json(reply.content)
+        return self._parsed(NewToken, reply)
 
     def revoke_token(self, name: str) -> None:
         """Refuse a token from now on."""
@@ -213,16 +214,16 @@ class Client:
     def collect_garbage(self, request: GcRequest) -> GcReport:
         """Free what archived jobs left behind."""
         reply = self._call("POST", "/v1/gc", json=request.model_dump(mode="json"))
-        return GcReport.model_validate_json(reply.content)
+        return self._parsed(GcReport, reply)
 
     def webhooks(self) -> tuple[WebhookView, ...]:
         """All webhooks, without their secrets."""
-        return TypeAdapter(tuple[WebhookView, ...]).validate_json(self._call("GET", "/v1/webhooks").content)
+        return self._parsed(tuple[WebhookView, ...], self._call("GET", "/v1/webhooks"))
 
     def add_webhook(self, request: WebhookRequest) -> NewWebhook:
         """Tell a URL of jobs' events from now on."""
         reply = self._call("POST", "/v1/webhooks", json=request.model_dump(mode="json"))
-        return NewWebhook.model_validate_json(reply.content)
+        return self._parsed(NewWebhook, reply)
 
     def remove_webhook(self, webhook_id: str) -> None:
         """Tell it nothing more."""
@@ -231,7 +232,7 @@ class Client:
     def deliveries(self, webhook_id: str) -> tuple[DeliveryView, ...]:
         """What became of each telling, newest first."""
         reply = self._call("GET", f"/v1/webhooks/{quote(webhook_id, safe='')}/deliveries")
-        return TypeAdapter(tuple[DeliveryView, ...]).validate_json(reply.content)
+        return self._parsed(tuple[DeliveryView, ...], reply)
 
     def task_log(self, task_id: str, tail: int | None = None) -> str:
         """What the attempts of a task wrote, or the last `tail` lines of it."""
@@ -255,7 +256,7 @@ class Client:
     def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
         """What a job published."""
         reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/artifacts")
-        return TypeAdapter(tuple[Artifact, ...]).validate_json(reply.content)
+        return self._parsed(tuple[Artifact, ...], reply)
 
     def download(self, job_id: str, artifact: Artifact, target: Path, on_bytes: OnBytes) -> None:
         """Write an artifact to `target`; whole and with the right hash, or the next try."""
@@ -323,7 +324,7 @@ class Client:
                 raise Unreachable(
                     str(error), where=self.url, remedy="Write the URL with http:// or https://."
                 ) from None
-            except httpx.TransportError as error:
+            except (httpx.TransportError, httpx.DecodingError) as error:
                 reason = str(error) or type(error).__name__
             else:
                 if response.is_success:
@@ -343,6 +344,13 @@ class Client:
                 )
             time.sleep(pause)
             pause = min(2 * pause, PAUSE_S[1])
+
+    def _parsed(self, kind: type[T], response: httpx.Response) -> T:
+        """The answer as what it should be; whoever else answers there, it is told and no defect."""
+        try:
+            return TypeAdapter(kind).validate_json(response.content)
+        except ValidationError:
+            raise self._error(response) from None
 
     def _error(self, response: httpx.Response) -> KilnError:
         asked = f"{response.request.method} {response.request.url.path}"

@@ -18,6 +18,7 @@ from typing import Any
 
 from kiln_schemas import program
 from kiln_schemas.errors import AuthError, InputError, KilnError, MachineLacks
+from kiln_schemas.files import read_small
 from kiln_schemas.logs import LogFormat, set_up
 from kiln_schemas.tasks import TaskKind, read_tags
 from kiln_workers.compare.arguments import add_compare
@@ -137,7 +138,7 @@ def _examples(options: argparse.Namespace) -> int:
 def _token(options: argparse.Namespace) -> str:
     if options.token_file is not None:
         try:
-            token: str = options.token_file.read_text().strip()
+            token: str = read_small(options.token_file).decode("ascii", "replace").strip()
         except OSError as error:
             raise InputError(f"cannot be read: {error.strerror}", where=str(options.token_file)) from None
     else:

@@ -31,6 +31,7 @@ from kiln_schemas.errors import (
     Problem,
     Unreachable,
 )
+from kiln_schemas.files import read_small
 from kiln_schemas.gates import GateResult, Gates, check_gates
 from kiln_schemas.job import JobRequest, JobView, TaskView
 from kiln_schemas.manifest import Manifest
@@ -318,15 +319,20 @@ def _summary(out: Path, job: JobView | None, tasks: tuple[TaskView, ...], began:
 
 def _gates_of(manifest: Path) -> tuple[GateResult, ...]:
     """The gates of a package that was baked before."""
-    return Manifest.model_validate_json(manifest.read_bytes()).gates
+    try:
+        return Manifest.model_validate_json(read_small(manifest)).gates
+    except (OSError, ValidationError):
+        raise Conflict(
+            "this is not a manifest that lightkiln wrote", where=str(manifest), remedy="Bake anew with --force."
+        ) from None
 
 
 def _read(path: Path) -> Record | None:
     try:
-        return Record.model_validate_json(path.read_bytes())
-    except FileNotFoundError:
+        return Record.model_validate_json(read_small(path))
+    except (FileNotFoundError, NotADirectoryError):
         return None
-    except ValidationError:
+    except (OSError, ValidationError):
         raise Conflict(
             "this is not a file that lightkiln wrote", where=str(path), remedy="Choose another --out, or pass --force."
         ) from None

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from kiln_schemas.client import Client
 from kiln_schemas.conventions import MANIFEST_JSON
 from kiln_schemas.errors import InputError, NotFound
+from kiln_schemas.files import read_small
 from kiln_schemas.job import JobView
 from kiln_schemas.manifest import Manifest
 from kiln_service.cli import options
@@ -123,7 +124,7 @@ def _environment(api: Client, job: JobView, out: Path) -> Path | None:
 def _is_package_of(folder: Path, job: str) -> bool:
     """Whether the package in `folder` is the job's; InputError where it is another's."""
     try:
-        found = Manifest.model_validate_json((folder / MANIFEST_JSON).read_text(encoding="utf-8"))
+        found = Manifest.model_validate_json(read_small(folder / MANIFEST_JSON))
     except (OSError, ValidationError):
         return False
     if found.job_id != job:

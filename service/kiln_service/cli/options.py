@@ -8,6 +8,7 @@ import typer
 
 from kiln_schemas.client import Client
 from kiln_schemas.errors import AuthError
+from kiln_schemas.files import read_small
 from kiln_schemas.logs import LogFormat
 
 DEFAULT_URL: Final = "http://127.0.0.1:8321"
@@ -82,7 +83,7 @@ def read_token(data: Path | None) -> str:
     if data is None:
         raise AuthError("no token is given", where="--token", remedy=remedy)
     try:
-        return (data / TOKEN_FILE).read_text().strip()
+        return read_small(data / TOKEN_FILE).decode("ascii", "replace").strip()
     except OSError as error:
         where = os.fspath(data / TOKEN_FILE)
         raise AuthError(f"the token cannot be read: {error.strerror}", where=where, remedy=remedy) from None

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from kiln_schemas.camera import REMEDY, Camera, read_camera
 from kiln_schemas.errors import InputError
+from kiln_schemas.files import read_small
 
 
 def read_cameras(names: list[str]) -> dict[str, Camera]:
@@ -23,8 +24,8 @@ def _of(text: str) -> dict[str, Camera]:
     if not path.is_file():
         return {f"camera-{text.replace(':', '_')}" if text.count(":") == 2 else path.stem: read_camera(text)}
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError):
+        document = json.loads(read_small(path))
+    except (ValueError, RecursionError, OSError):
         raise InputError("is not JSON", where=text, remedy=REMEDY) from None
     if isinstance(document, dict) and document and all(isinstance(value, dict) for value in document.values()):
         return {name: _parse(value, f"{text}: {name}") for name, value in document.items()}

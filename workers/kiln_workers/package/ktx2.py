@@ -17,6 +17,7 @@ import zstandard
 
 from kiln_schemas import __version__
 from kiln_schemas.errors import InputError, InternalError
+from kiln_schemas.files import open_regular
 from kiln_workers.package.files import write_bytes
 from kiln_workers.package.ktx2_validate import validate
 
@@ -141,7 +142,12 @@ def decode(data: bytes, *, where: str = "KTX2") -> Texture:
 
 def read(path: Path) -> Texture:
     """Read and check a half-float KTX 2.0 file; InputError names the first fault."""
-    return decode(path.read_bytes(), where=path.name)
+    try:
+        with open_regular(path) as file:
+            data = file.read()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=path.name) from None
+    return decode(data, where=path.name)
 
 
 def _check(texture: Texture) -> None:

@@ -12,6 +12,7 @@ import torch
 
 from kiln_schemas.camera import read_camera
 from kiln_schemas.errors import InputError
+from kiln_schemas.files import open_regular
 from kiln_workers.package import colour
 from kiln_workers.render.backend import select_variant
 from kiln_workers.scene.environment import read_environment
@@ -101,7 +102,8 @@ def read_scene(path: Path, env: Path | None, scale: float, rotation_deg: float) 
     if env is None:
         return scene
     try:
-        data = env.read_bytes()
+        with open_regular(env) as file:
+            data = file.read()
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(env)) from None
     pixels, _ = read_environment(data, str(env))

@@ -26,6 +26,7 @@ from kiln_schemas.conventions import (
     VISIBILITY_KTX2,
 )
 from kiln_schemas.errors import InputError, NotFound
+from kiln_schemas.files import open_regular, read_small
 from kiln_schemas.manifest import Manifest
 from kiln_workers.package import ktx2
 from kiln_workers.package.half import layers_to_lobes
@@ -133,11 +134,14 @@ def read_manifest(folder: Path) -> Manifest:
     """The manifest of a package."""
     path = folder / MANIFEST_JSON
     try:
-        manifest = Manifest.model_validate_json(path.read_text(encoding="utf-8"))
+        manifest = Manifest.model_validate_json(read_small(path))
     except FileNotFoundError:
         raise NotFound("there is no package", where=str(folder), remedy="Name a folder with a manifest.json.") from None
-    except (OSError, ValidationError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {type(error).__name__}", where=str(path), remedy="Bake it again.") from None
+    except NotADirectoryError:
+        raise NotFound("there is no package", where=str(folder), remedy="Name a folder with a manifest.json.") from None
+    except (OSError, ValidationError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not a manifest"
+        raise InputError(f"cannot be read: {reason}", where=str(path), remedy="Bake it again.") from None
     if manifest.format_version > FORMAT_VERSION:
         raise InputError(
             f"has format version {manifest.format_version}, this program reads up to {FORMAT_VERSION}",
@@ -150,7 +154,8 @@ def read_manifest(folder: Path) -> Manifest:
 def read_exr(path: Path) -> Float32:
     """Linear RGB [H, W, 3] of an EXR; InputError where it cannot be read."""
     try:
-        with OpenEXR.File(str(path)) as file:
+        # By its descriptor: the library opens by name, and would wait for a pipe.
+        with open_regular(path) as regular, OpenEXR.File(f"/dev/fd/{regular.fileno()}") as file:
             channels = file.channels()
             if "RGB" not in channels:
                 raise InputError(f"has the channels {', '.join(channels)} instead of R, G, B", where=str(path))
