@@ -350,7 +350,11 @@ class Client:
         try:
             return TypeAdapter(kind).validate_json(response.content)
         except ValidationError:
-            raise self._error(response) from None
+            raise Unreachable(
+                f"unexpected answer {response.status_code} to {response.request.method} {response.request.url.path}",
+                where=self.url,
+                remedy="Check that this URL is a lightkiln coordinator.",
+            ) from None
 
     def _error(self, response: httpx.Response) -> KilnError:
         asked = f"{response.request.method} {response.request.url.path}"
