@@ -31,6 +31,8 @@ MOST_POINTS: Final = 10_000
 MOST_FILES: Final = 4096
 """Of a bundle, and of a package."""
 TILE_TEXELS: Final = 64 * 64
+Texel = Annotated[int, Field(ge=0, lt=8192)]
+"""A row or a column of the light map."""
 Between = Annotated[tuple[Sha256, ...], Field(max_length=3)]
 Renders = Annotated[tuple["RenderResult", ...], Field(max_length=MOST_TILES)]
 
@@ -65,18 +67,18 @@ class Bundle(Contract):
 class Block(Contract):
     """A square of the light map that is refined as one task: first row and column, texels along each side."""
 
-    row: Number
-    column: Number
-    size: int = Field(ge=1, lt=2**31)
+    row: Texel
+    column: Texel
+    size: int = Field(ge=1, le=256)
 
 
 class Tile(Contract):
     """A square of the light map: first row and column, texels along each side, texels that have a surface point."""
 
-    row: Number
-    column: Number
-    size: int = Field(ge=1, lt=2**31)
-    texels: Number
+    row: Texel
+    column: Texel
+    size: int = Field(ge=1, le=64)
+    texels: int = Field(ge=0, le=TILE_TEXELS)
 
 
 class PreparePayload(Contract):

@@ -19,7 +19,7 @@ from psycopg.types.json import Jsonb
 from kiln_schemas.errors import NotFound
 from kiln_schemas.job import EventView
 from kiln_schemas.states import FINAL_JOB_STATES, JobState
-from kiln_service.db import Database, Tx
+from kiln_service.db import Database, Tx, readable_rows
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ async def _read(database: Database, job_id: str, after: int, limit: int) -> tupl
         if job is None:
             raise NotFound(f"no job '{job_id}'", where="job")
         rows = await tx.all("read_events", job_id=job_id, after=after, limit=limit)
-    return JobState(job["state"]), [EventView.model_validate(row) for row in rows]
+    return JobState(job["state"]), readable_rows(EventView, rows)
 
 
 async def is_over(database: Database, job_id: str, after: int) -> bool:

@@ -23,7 +23,7 @@ from kiln_schemas.operators import (
 )
 from kiln_service import queue
 from kiln_service.config import OWN_TOKEN, ServiceConfig
-from kiln_service.db import Database, Tx, picked
+from kiln_service.db import Database, Tx, picked, readable_rows
 
 OFFLINE_S: Final = 60.0
 ERROR_AFTER: Final = 3
@@ -81,7 +81,7 @@ async def list_workers(database: Database) -> tuple[WorkerView, ...]:
     """Workers that were seen within a week."""
     async with database.transaction() as tx:
         rows = await tx.all("list_workers", offline_s=OFFLINE_S, forgotten_s=FORGOTTEN_S)
-    return tuple(_worker_view(row) for row in rows)
+    return tuple(readable_rows(WorkerView, [_worker_values(row) for row in rows]))
 
 
 async def order_worker(database: Database, worker_id: str, order: Order, actor: str) -> None:
@@ -122,7 +122,7 @@ async def drop_schedule(database: Database, worker: str, actor: str) -> None:
 async def list_audit(database: Database, before: int | None, limit: int) -> tuple[AuditEntry, ...]:
     """The record, newest first."""
     async with database.transaction() as tx:
-        return tuple(AuditEntry.model_validate(row) for row in await tx.all("list_audit", before=before, limit=limit))
+        return tuple(readable_rows(AuditEntry, await tx.all("list_audit", before=before, limit=limit)))
 
 
 async def record(tx: Tx, actor: str, action: str, target: str, detail: Mapping[str, Any] | None = None) -> None:
@@ -130,10 +130,10 @@ async def record(tx: Tx, actor: str, action: str, target: str, detail: Mapping[s
     await tx.run("add_audit", actor=actor, action=action, target=target, detail=Jsonb(dict(detail or {})))
 
 
-def _worker_view(row: DictRow) -> WorkerView:
+def _worker_values(row: DictRow) -> DictRow:
     task = None if row["task_id"] is None else f"{row['kind']} {row['label']}"
     made = {"state": _state(row), "task": task, "schedule": _schedule(row)}
-    return WorkerView.model_validate({name: row[name] for name in WorkerView.model_fields if name not in made} | made)
+    return {name: row[name] for name in WorkerView.model_fields if name not in made} | made
 
 
 def _schedule(row: DictRow) -> SleepSchedule | None:

@@ -21,7 +21,7 @@ from kiln_schemas.tasks import (
     RenderResult,
     TaskKind,
 )
-from kiln_service.db import JobRow, TaskRow, Tx
+from kiln_service.db import JobRow, TaskRow, Tx, readable
 
 
 async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Payload:
@@ -61,7 +61,7 @@ async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Payload:
                 prepare=await _prepared(tx, job),
                 renders=await _renders(tx, job),
                 fits=await _fits(tx, job),
-                refines=tuple(RefineResult.model_validate(row["result"]) for row in refines),
+                refines=tuple(readable(RefineResult, row["result"]) for row in refines),
                 gates=job.gates,
                 cameras=job.cameras,
             )
@@ -76,17 +76,17 @@ def _prepared_blobs(job: JobRow) -> dict[str, Any]:
 
 async def _prepared(tx: Tx, job: JobRow) -> PrepareResult:
     row = await tx.one("results_of_kind", job_id=job.id, kind=TaskKind.PREPARE)
-    return PrepareResult.model_validate(row["result"])
+    return readable(PrepareResult, row["result"])
 
 
 async def _fits(tx: Tx, job: JobRow) -> tuple[FitResult, ...]:
     rows = await tx.all("results_of_kind", job_id=job.id, kind=TaskKind.FIT)
-    return tuple(FitResult.model_validate(row["result"]) for row in rows)
+    return tuple(readable(FitResult, row["result"]) for row in rows)
 
 
 async def _renders(tx: Tx, job: JobRow) -> tuple[RenderResult, ...]:
     rows = await tx.all("results_of_kind", job_id=job.id, kind=TaskKind.RENDER)
-    return tuple(RenderResult.model_validate(row["result"]) for row in rows)
+    return tuple(readable(RenderResult, row["result"]) for row in rows)
 
 
 async def _renders_near(tx: Tx, job: JobRow, block: Block) -> tuple[RenderResult, ...]:
@@ -100,4 +100,4 @@ async def _renders_near(tx: Tx, job: JobRow, block: Block) -> tuple[RenderResult
         column_start=block.column - REFINE_HALO,
         column_stop=block.column + reach,
     )
-    return tuple(RenderResult.model_validate(row["result"]) for row in rows)
+    return tuple(readable(RenderResult, row["result"]) for row in rows)

@@ -6,12 +6,14 @@ from typing import Final
 
 from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
+from pydantic import ValidationError
 
-from kiln_schemas.errors import InputError, NotFound
+from kiln_schemas.errors import InputError, InternalError, NotFound
 from kiln_schemas.job import CurveView, JobPage, JobView, StageView, TaskView
 from kiln_schemas.states import FINAL_JOB_STATES, OVER_TASK_STATES, JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
-from kiln_service.db import Database, JobRow, TaskRow, Tx
+from kiln_service.db import Database, JobRow, TaskRow, Tx, job_rows, readable, readable_rows
+from kiln_service.db.lenient import note_unreadable
 from kiln_service.events import EVENT_CHANNEL, Signals, wait
 from kiln_service.planner import METHODS
 
@@ -27,7 +29,10 @@ async def job_view(database: Database, job_id: str) -> JobView:
         row = await tx.maybe("find_job", id=job_id)
         if row is None:
             raise NotFound(f"no job '{job_id}'", where="job")
-        return (await _views(tx, [JobRow.of(row)]))[0]
+        found = await _views(tx, [JobRow.of(row)])
+    if not found:
+        raise InternalError(f"job {job_id} cannot be read", where="job", remedy="The coordinator's log says why.")
+    return found[0]
 
 
 async def job_page(
@@ -52,8 +57,8 @@ async def job_page(
             text=text,
             limit=limit + 1,
         )
-        views = await _views(tx, [JobRow.of(row) for row in rows[:limit]])
-    return JobPage(jobs=tuple(views), next=views[-1].id if len(rows) > limit else None)
+        views = await _views(tx, job_rows(rows[:limit]))
+    return JobPage(jobs=tuple(views), next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
 
 async def task_views(
@@ -71,7 +76,7 @@ async def curves(database: Database, job_id: str) -> tuple[CurveView, ...]:
     async with database.transaction() as tx:
         await _require_job(tx, job_id)
         rows = await tx.all("list_curves", job_id=job_id, points=CURVE_POINTS)
-    return tuple(CurveView.model_validate(row) for row in rows)
+    return tuple(readable_rows(CurveView, rows))
 
 
 async def task_log(database: Database, task_id: str, tail: int | None = None) -> str:
@@ -129,7 +134,7 @@ async def artifacts(database: Database, job_id: str) -> tuple[Artifact, ...]:
     async with database.transaction() as tx:
         await _require_job(tx, job_id)
         rows = await tx.all("list_artifacts", job_id=job_id)
-    return tuple(Artifact.model_validate(row) for row in rows)
+    return tuple(readable_rows(Artifact, rows))
 
 
 async def artifact(database: Database, job_id: str, name: str) -> Artifact:
@@ -177,41 +182,49 @@ def _remaining_of_kind(row: DictRow) -> float | None:
         each = sum(told) / len(told)
         parts = [each * (1 - fraction) for fraction, _ in running]
     idle = each * (unfinished - len(running))
-    return float(max((sum(parts) + idle) / max(len(running), 1), max(parts, default=0.0)))
+    return float(max((sum(parts) + idle) / max(len(running), 1), max(parts, default=0.0), 0.0))
 
 
 async def _views(tx: Tx, jobs: Sequence[JobRow]) -> list[JobView]:
+    """Those that can be shown."""
     by_job: dict[str, dict[str, DictRow]] = {job.id: {} for job in jobs}
     for row in await tx.all("stages", job_ids=list(by_job)):
         by_job[row["job_id"]][row["kind"]] = row
-    return [_job_view(job, by_job[job.id]) for job in jobs]
+    views = []
+    for job in jobs:
+        try:
+            views.append(_job_view(job, by_job[job.id]))
+        except (ValidationError, KeyError) as error:
+            note_unreadable("job", {"id": job.id}, error)
+    return views
 
 
 def _job_view(job: JobRow, rows: dict[str, DictRow]) -> JobView:
     ordered = [rows[kind] for kind in METHODS[job.method].stages if kind in rows]
-    return JobView(
-        id=job.id,
-        name=job.name,
-        state=job.state,
-        settings=job.settings,
-        bundle=job.bundle,
-        created=job.created,
-        started=job.started,
-        finished=job.finished,
-        stages=tuple(_stage_view(row) for row in ordered),
-        remaining_s=None if job.state in FINAL_JOB_STATES else remaining_seconds(ordered),
-        notes=job.notes,
-        error=job.error,
-        gates=job.gates,
-        cameras=job.cameras,
-        gate_results=job.gate_results,
-        priority=job.priority,
-        labels=job.labels,
-        tags=job.tags,
-        outcome=job.outcome,
-        submitter=job.submitter,
-        renders_of=job.renders_of,
-    )
+    values = {
+        "id": job.id,
+        "name": job.name,
+        "state": job.state,
+        "settings": job.settings,
+        "bundle": job.bundle,
+        "created": job.created,
+        "started": job.started,
+        "finished": job.finished,
+        "stages": tuple(_stage_view(row) for row in ordered),
+        "remaining_s": None if job.state in FINAL_JOB_STATES else remaining_seconds(ordered),
+        "notes": job.notes,
+        "error": job.error,
+        "gates": job.gates,
+        "cameras": job.cameras,
+        "gate_results": job.gate_results,
+        "priority": job.priority,
+        "labels": job.labels,
+        "tags": job.tags,
+        "outcome": job.outcome,
+        "submitter": job.submitter,
+        "renders_of": job.renders_of,
+    }
+    return readable(JobView, values)
 
 
 def _stage_view(row: DictRow) -> StageView:
@@ -222,26 +235,27 @@ def _stage_view(row: DictRow) -> StageView:
         active=row["active"],
         failed=row["failed"],
         soft_failed=row["soft_failed"],
-        fraction=(row["completed"] + sum(row["fractions"] or [])) / row["total"],
-        seconds=row["seconds"],
+        fraction=min((row["completed"] + sum(row["fractions"] or [])) / row["total"], 1.0),
+        seconds=max(row["seconds"], 0.0),  # a clock that was set back makes it negative
     )
 
 
 def task_view(task: TaskRow, worker: str | None) -> TaskView:
     """A task with the name of its worker."""
-    return TaskView(
-        id=task.id,
-        kind=task.kind,
-        label=task.label,
-        state=task.state,
-        attempt=task.attempt,
-        worker=worker,
-        progress=task.progress,
-        created=task.created,
-        started=task.started,
-        finished=task.finished,
-        error=task.error,
-    )
+    values = {
+        "id": task.id,
+        "kind": task.kind,
+        "label": task.label,
+        "state": task.state,
+        "attempt": task.attempt,
+        "worker": worker,
+        "progress": task.progress,
+        "created": task.created,
+        "started": task.started,
+        "finished": task.finished,
+        "error": task.error,
+    }
+    return readable(TaskView, values)
 
 
 async def require_task(database: Database, task_id: str) -> None:

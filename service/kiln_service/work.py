@@ -43,7 +43,7 @@ from kiln_service.batches import Batches
 from kiln_service.blobs import drop_blobs, require_blobs, use_blobs
 from kiln_service.blocks import note_failure
 from kiln_service.config import ServiceConfig
-from kiln_service.db import Database, JobRow, TaskRow, Tx, WorkerRow, fetched
+from kiln_service.db import Database, JobRow, TaskRow, Tx, WorkerRow, fetched, readable
 from kiln_service.events import QUEUED_CHANNEL, Signals, add_event, wait
 from kiln_service.ids import new_id
 from kiln_service.jobs import settle_cancel
@@ -385,7 +385,7 @@ async def _fan_in(tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
     left = await tx.one("stage_left", job_id=job.id, kind=task.kind)
     if left["unfinished"]:
         if left["stuck"]:
-            await transitions.fail_job(tx, job, Problem.model_validate(left["stuck"]), transitions.COORDINATOR)
+            await transitions.fail_job(tx, job, readable(Problem, left["stuck"]), transitions.COORDINATOR)
         return
     stage = METHODS[job.method].stage_after(task.kind)
     while stage is not None and not (await tx.one("stage_left", job_id=job.id, kind=stage))["unfinished"]:

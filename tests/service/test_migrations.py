@@ -4,6 +4,7 @@ import hashlib
 import subprocess
 from pathlib import Path
 
+import psycopg
 import pytest
 
 from kiln_service.db.migrate import migrations
@@ -21,6 +22,9 @@ def test_a_released_database_is_migrated_and_its_jobs_go_on(file, start, dsn, po
     place = start.data / "blobs" / sha256[:2] / sha256
     place.parent.mkdir(parents=True)
     place.write_bytes(PACKAGE)
+    with psycopg.connect(dsn, autocommit=True) as connection:
+        odd = 'UPDATE tasks SET progress = \'{"done": 1e308, "total": 1e-308, "unit": ""}\' WHERE state = \'active\''
+        assert connection.execute(odd).rowcount == 1
     with start(timing=fast) as home:
         versions = [row["version"] for row in home.sql("SELECT version FROM kiln_migrations ORDER BY version")]
         assert versions == [number for number, _, _ in migrations()] and versions[-1] > int(file.stem)
@@ -35,6 +39,7 @@ def test_a_released_database_is_migrated_and_its_jobs_go_on(file, start, dsn, po
         assert home.client.get(f"{artifacts}/lightfield.ktx2").content == PACKAGE
         running = jobs["running"]["id"]
         (kept,) = home.tasks(running, kind="render", state="completed")
+        assert kept["worker"] and home.client.get("/v1/metrics").status_code == 200
         before = [event["id"] for event in home.events(running)]
         eventually(lambda: not home.tasks(running, kind="render", state="active"))
         worker = home.worker("new")

@@ -17,7 +17,7 @@ from kiln_service.api.common import Parts, PartsHere, caller
 from kiln_service.auth import Principal
 from kiln_service.dashboard.jobs import stretch
 from kiln_service.dashboard.pages import Form, page, see
-from kiln_service.db import Database, TaskRow
+from kiln_service.db import Database, TaskRow, readable_rows
 
 router = APIRouter(include_in_schema=False)
 
@@ -66,7 +66,7 @@ async def job(request: Request, job_id: str, parts: PartsHere) -> Response:
     view = await views.job_view(parts.database, job_id)
     async with parts.database.transaction() as tx:
         tasks = await tx.all("tasks_of_note", job_id=job_id, limit=TASKS)
-        events = [EventView.model_validate(row) for row in await tx.all("last_events", job_id=job_id, limit=EVENTS)]
+        events = readable_rows(EventView, await tx.all("last_events", job_id=job_id, limit=EVENTS))
     return page(
         request,
         "job.html",

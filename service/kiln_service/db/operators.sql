@@ -84,17 +84,17 @@ SELECT state, count(*) AS jobs FROM jobs GROUP BY state;
 
 -- name: sum_work
 -- Completed attempts by kind and by how many of the bounds, in seconds, each took longer than; what tiles rendered.
-SELECT kind, width_bucket((result ->> 'seconds')::float8, %(bounds)s::float8[]) AS bucket, count(*) AS tasks,
-       sum((result ->> 'seconds')::float8) AS seconds,
-       COALESCE(sum((result ->> 'paths')::float8), 0) AS paths,
-       COALESCE(sum((spec -> 'tile' ->> 'texels')::float8), 0) AS texels
-FROM tasks WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind, bucket;
+SELECT kind, width_bucket(took.seconds, %(bounds)s::float8[]) AS bucket, count(*) AS tasks, sum(took.seconds) AS seconds,
+       COALESCE(sum(figure(result -> 'paths', 1e18)), 0) AS paths,
+       COALESCE(sum(figure(spec -> 'tile' -> 'texels', 1e9)), 0) AS texels
+FROM tasks CROSS JOIN LATERAL (SELECT COALESCE(figure(result -> 'seconds', 1e9), 0) AS seconds) AS took
+WHERE state = 'completed' AND worker_id IS NOT NULL GROUP BY kind, bucket;
 
 -- name: sum_light_fields
 -- Bytes of radiance (three halves a pixel) in stores that are not freed, each counted once.
-SELECT COALESCE(sum((tasks.spec -> 'tile' ->> 'texels')::bigint * readers.pixels * 6), 0)::bigint AS bytes
+SELECT COALESCE(sum(figure(tasks.spec -> 'tile' -> 'texels', 1e9) * readers.pixels * 6), 0) AS bytes
 FROM (
-    SELECT DISTINCT ON (store_url) id, ((settings -> 'render' ->> 'image_size')::bigint) ^ 2 AS pixels
+    SELECT DISTINCT ON (store_url) id, figure(settings -> 'render' -> 'image_size', 1e6) ^ 2 AS pixels
     FROM jobs WHERE freed IS NULL ORDER BY store_url, id
 ) AS readers
 JOIN tasks ON tasks.job_id = readers.id AND tasks.kind = 'render' AND tasks.state = 'completed';

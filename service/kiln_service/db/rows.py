@@ -1,10 +1,12 @@
 """Rows of the database as frozen dataclasses with the contracts' types."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any, Self, TypeVar
 
 from psycopg.rows import DictRow
+from pydantic import ValidationError
 
 from kiln_schemas.base import Contract
 from kiln_schemas.camera import Camera
@@ -13,6 +15,7 @@ from kiln_schemas.gates import GateResult, Gates
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Bundle, Progress, TaskKind
+from kiln_service.db.lenient import note_unreadable, readable, readable_or, readable_problem, readable_rows
 
 C = TypeVar("C", bound=Contract)
 
@@ -25,7 +28,7 @@ class _Row:
 
 def picked(contract: type[C], row: DictRow) -> C:
     """A contract of those of a row's columns that it names."""
-    return contract.model_validate({name: row[name] for name in contract.model_fields})
+    return readable(contract, {name: row[name] for name in contract.model_fields})
 
 
 @dataclass(frozen=True)
@@ -64,17 +67,28 @@ class JobRow(_Row):
             **values
             | {
                 "state": JobState(values["state"]),
-                "settings": BakeSettings.model_validate(values["settings"]),
+                "settings": readable(BakeSettings, values["settings"]),
                 "outcome": values["outcome"] and JobState(values["outcome"]),
-                "bundle": Bundle.model_validate(values["bundle"]),
-                "gates": Gates.model_validate(values["gates"]),
-                "cameras": {name: Camera.model_validate(tree) for name, tree in values["cameras"].items()},
-                "gate_results": tuple(GateResult.model_validate(tree) for tree in values["gate_results"]),
+                "bundle": readable(Bundle, values["bundle"]),
+                "gates": readable(Gates, values["gates"]),
+                "cameras": {name: readable(Camera, tree) for name, tree in values["cameras"].items()},
+                "gate_results": tuple(readable_rows(GateResult, values["gate_results"])),
                 "notes": tuple(values["notes"]),
                 "tags": tuple(values["tags"]),
-                "error": values["error"] and Problem.model_validate(values["error"]),
+                "error": readable_problem(values["error"]),
             }
         )
+
+
+def job_rows(rows: Iterable[DictRow]) -> list[JobRow]:
+    """Those that can be read."""
+    found = []
+    for row in rows:
+        try:
+            found.append(JobRow.of(row))
+        except (ValidationError, ValueError) as error:
+            note_unreadable("job", row, error)
+    return found
 
 
 @dataclass(frozen=True)
@@ -109,8 +123,8 @@ class TaskRow(_Row):
             | {
                 "kind": TaskKind(values["kind"]),
                 "state": TaskState(values["state"]),
-                "progress": values["progress"] and Progress.model_validate(values["progress"]),
-                "error": values["error"] and Problem.model_validate(values["error"]),
+                "progress": readable_or(Progress, values["progress"], None),
+                "error": readable_problem(values["error"]),
             }
         )
 

@@ -27,8 +27,9 @@ SELECT job_id, kind,
        count(*) FILTER (WHERE state = 'failed') AS failed,
        count(*) FILTER (WHERE state = 'soft-failed') AS soft_failed,
        COALESCE(sum(extract(epoch FROM finished - started)) FILTER (WHERE state = 'completed'), 0)::float8 AS seconds,
-       array_agg(LEAST(COALESCE((progress ->> 'done')::float8 / (progress ->> 'total')::float8, 0), 1)
-           ORDER BY ordinal) FILTER (WHERE state = 'active') AS fractions,
+       array_agg(COALESCE(LEAST(
+               GREATEST(figure(progress -> 'done', 1e15), 0) / GREATEST(figure(progress -> 'total', 1e15), 1e-6), 1
+           ), 0) ORDER BY ordinal) FILTER (WHERE state = 'active') AS fractions,
        array_agg(extract(epoch FROM now() - started)::float8
            ORDER BY ordinal) FILTER (WHERE state = 'active') AS elapsed
 FROM tasks
@@ -65,13 +66,15 @@ SELECT name, sha256, size, media_type FROM artifacts WHERE job_id = %(job_id)s A
 -- name: list_curves
 -- Losses of a job's tasks over their steps: those of the result, or those told so far, at most `points` of these.
 SELECT tasks.id AS task_id, tasks.kind, tasks.label, tasks.state,
-       COALESCE((progress ->> 'total')::float8, (result ->> 'steps')::float8) AS steps,
+       COALESCE(figure(progress -> 'total', 1e15), figure(result -> 'steps', 1e15)) AS steps,
        COALESCE(
-           (SELECT jsonb_agg(jsonb_build_array(point -> 'step', point -> 'loss') ORDER BY (point ->> 'step')::float8)
-            FROM jsonb_array_elements(result -> 'curve') AS point),
+           (SELECT jsonb_agg(jsonb_build_array(point -> 'step', point -> 'loss') ORDER BY figure(point -> 'step', 1e15))
+            FROM jsonb_array_elements(
+                CASE WHEN jsonb_typeof(result -> 'curve') = 'array' THEN result -> 'curve' END
+            ) AS point),
            (SELECT jsonb_agg(jsonb_build_array(step, loss) ORDER BY step) FROM (
                SELECT step, loss, row_number() OVER (ORDER BY step DESC) AS place, count(*) OVER () AS told FROM losses
-               WHERE task_id = tasks.id AND step <= COALESCE((progress ->> 'done')::float8, 'Infinity')
+               WHERE task_id = tasks.id AND step <= COALESCE(figure(progress -> 'done', 1e15), 'Infinity')
            ) AS numbered WHERE (place - 1) %% (1 + told / %(points)s) = 0),
            '[]'
        ) AS points
