@@ -56,6 +56,7 @@ from kiln_schemas.operators import (
     WebhookView,
     WorkerView,
 )
+from kiln_schemas.options import check_key
 from kiln_schemas.proxies import is_loopback
 from kiln_schemas.states import JobState
 from kiln_schemas.tasks import Artifact, TaskKind
@@ -136,7 +137,7 @@ class Client:
 
     def submit(self, request: JobRequest, key: str | None = None) -> JobView:
         """Submit a job whose files are uploaded; a repetition under the same `key` makes no second job."""
-        headers = {"Idempotency-Key": key} if key else {}
+        headers = {} if key is None else {"Idempotency-Key": check_key(key)}
         reply = self._call("POST", "/v1/jobs", json=request.model_dump(mode="json"), headers=headers)
         return self._parsed(JobView, reply)
 
@@ -163,20 +164,20 @@ class Client:
         reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/curves")
         return self._parsed(tuple[CurveView, ...], reply)
 
-    def act(self, job_id: str, action: Literal["pause", "resume", "cancel", "retry", "archive"]) -> JobView:
-        """Ask something of a job."""
-        return self._parsed(JobView, self._call("POST", f"/v1/jobs/{quote(job_id, safe='')}/{action}"))
+    def act(self, job_id: str, action: Literal["pause", "resume", "cancel", "retry", "archive"]) -> JobView | None:
+        """Ask something of a job; the job afterwards, or None where the token may not look at jobs."""
+        return self._seen(self._call("POST", f"/v1/jobs/{quote(job_id, safe='')}/{action}"))
 
-    def requeue(self, job_id: str, wanted: RequeueRequest) -> JobView:
-        """Do tasks again that are done, and what follows from them."""
+    def requeue(self, job_id: str, wanted: RequeueRequest) -> JobView | None:
+        """Do tasks again that are done, and what follows from them; answers as `act` does."""
         body = wanted.model_dump(mode="json", exclude_none=True)
         path = f"/v1/jobs/{quote(job_id, safe='')}/requeue"
-        return self._parsed(JobView, self._call("POST", path, json=body))
+        return self._seen(self._call("POST", path, json=body))
 
-    def change(self, job_id: str, wanted: JobChange) -> JobView:
-        """Rank or label a job anew."""
+    def change(self, job_id: str, wanted: JobChange) -> JobView | None:
+        """Rank or label a job anew; answers as `act` does."""
         body = wanted.model_dump(mode="json", exclude_none=True)
-        return self._parsed(JobView, self._call("PATCH", f"/v1/jobs/{quote(job_id, safe='')}", json=body))
+        return self._seen(self._call("PATCH", f"/v1/jobs/{quote(job_id, safe='')}", json=body))
 
     def workers(self) -> tuple[WorkerView, ...]:
         """Workers that were seen within a week."""
@@ -355,6 +356,9 @@ class Client:
                 where=self.url,
                 remedy="Check that this URL is a lightkiln coordinator.",
             ) from None
+
+    def _seen(self, reply: httpx.Response) -> JobView | None:
+        return None if reply.status_code == httpx.codes.NO_CONTENT else self._parsed(JobView, reply)
 
     def _error(self, response: httpx.Response) -> KilnError:
         asked = f"{response.request.method} {response.request.url.path}"

@@ -6,7 +6,7 @@ worker is there (`Work.claim`), as it has to hand on the signal that woke it; a 
 
 import asyncio
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from starlette.datastructures import Headers
@@ -63,7 +63,7 @@ class _Client:
         self._taken: Message | None = None
         self._watch: asyncio.Task[None] | None = None
         self.gone = asyncio.Event()
-        self.on_leave = lambda: None
+        self.on_leave: Callable[[], None] = lambda: None
 
     async def take_body(self) -> None:
         """Take the message of an empty body now, so that its client is watched though no route reads it."""

@@ -79,3 +79,26 @@ def test_the_token_file_is_the_owners_alone_and_stays(tmp_path):
     assert own_token(tmp_path) == first
     assert [file.name for file in tmp_path.iterdir()] == ["token"]
     assert len((tmp_path / "token").read_text().strip()) >= 43
+
+
+def test_a_token_that_may_only_submit_sees_no_job_by_what_it_asks_of_one(home, result):
+    """PATCH, and every other route of its scope that answers with a job."""
+    scopes = {"name": "ci", "scopes": ["submit"]}
+    token = home.client.post("/v1/tokens", json=scopes).raise_for_status().json()["token"]
+    done, worker = home.submit(name="secret name"), home.worker()
+    while home.job(done["id"])["state"] != "completed":
+        worker.finish(worker.must_claim())
+    live = home.submit(name="secret name")
+    with httpx.Client(base_url=home.url, headers={"Authorization": f"Bearer {token}"}) as client:
+        replies = {"patch": client.patch(f"/v1/jobs/{live['id']}", json={})}
+        for job, actions in ((live, ("pause", "resume", "cancel", "retry", "cancel", "archive")), (done, ("requeue",))):
+            for action in actions:
+                path = f"/v1/jobs/{job['id']}/{action}"
+                body = {"kind": "package"} if action == "requeue" else None
+                replies[f"{job['id']} {action}"] = client.post(path, json=body)
+        assert {name: reply.status_code for name, reply in replies.items()} == dict.fromkeys(replies, 204)
+        assert not any(reply.content for reply in replies.values())
+        for path in (f"/v1/jobs/{live['id']}", "/v1/jobs", "/v1/workers", "/v1/metrics"):
+            assert client.get(path).status_code == 403
+    assert home.job(live["id"])["state"] == "archived" and home.job(done["id"])["state"] == "queued"
+    assert home.client.patch(f"/v1/jobs/{done['id']}", json={}).json()["name"] == "secret name"

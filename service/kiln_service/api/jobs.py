@@ -21,7 +21,7 @@ from kiln_schemas.operators import Scope
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
 from kiln_service import jobs, views
-from kiln_service.api.common import PartsHere, caller, problems
+from kiln_service.api.common import Parts, PartsHere, caller, problems
 from kiln_service.api.files import serve_blob
 from kiln_service.auth import Principal
 from kiln_service.events import BATCH, is_over, read_events, stream_events
@@ -33,6 +33,7 @@ UNBUFFERED: Final = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
 
 Reader = Depends(caller(Scope.READ))
 Submitter = Annotated[Principal, Depends(caller(Scope.SUBMIT))]
+UNSEEN: Final[dict[int | str, dict[str, Any]]] = {204: {"description": "Done; the token may not look at jobs"}}
 
 
 @router.post("/jobs", status_code=201, responses=problems(409, 413, 422))
@@ -83,53 +84,53 @@ async def job(job_id: str, parts: PartsHere) -> JobView:
     return await views.job_view(parts.database, job_id)
 
 
-@router.post("/jobs/{job_id}/cancel", responses=problems(404, 409))
-async def cancel(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
+@router.post("/jobs/{job_id}/cancel", response_model=JobView, responses=problems(404, 409) | UNSEEN)
+async def cancel(job_id: str, parts: PartsHere, who: Submitter) -> JobView | Response:
     """Ask the job to stop; it is canceled once its running tasks have stopped."""
     await jobs.cancel(parts.database, job_id, who.actor)
-    return await views.job_view(parts.database, job_id)
+    return await _seen(parts, job_id, who)
 
 
-@router.patch("/jobs/{job_id}", responses=problems(404, 422))
-async def change(job_id: str, wanted: JobChange, parts: PartsHere, who: Submitter) -> JobView:
+@router.patch("/jobs/{job_id}", response_model=JobView, responses=problems(404, 422) | UNSEEN)
+async def change(job_id: str, wanted: JobChange, parts: PartsHere, who: Submitter) -> JobView | Response:
     """Rank the job anew among those that wait, or label it anew."""
     await jobs.change(parts.database, job_id, wanted, who.actor)
-    return await views.job_view(parts.database, job_id)
+    return await _seen(parts, job_id, who)
 
 
-@router.post("/jobs/{job_id}/pause", responses=problems(404, 409))
-async def pause(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
+@router.post("/jobs/{job_id}/pause", response_model=JobView, responses=problems(404, 409) | UNSEEN)
+async def pause(job_id: str, parts: PartsHere, who: Submitter) -> JobView | Response:
     """Give no more of its tasks to workers; those that run go on to their end."""
     await jobs.pause(parts.database, job_id, who.actor)
-    return await views.job_view(parts.database, job_id)
+    return await _seen(parts, job_id, who)
 
 
-@router.post("/jobs/{job_id}/resume", responses=problems(404, 409))
-async def resume(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
+@router.post("/jobs/{job_id}/resume", response_model=JobView, responses=problems(404, 409) | UNSEEN)
+async def resume(job_id: str, parts: PartsHere, who: Submitter) -> JobView | Response:
     """Go on with a paused job."""
     await jobs.resume(parts.database, job_id, who.actor)
-    return await views.job_view(parts.database, job_id)
+    return await _seen(parts, job_id, who)
 
 
-@router.post("/jobs/{job_id}/retry", responses=problems(404, 409))
-async def retry(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
+@router.post("/jobs/{job_id}/retry", response_model=JobView, responses=problems(404, 409) | UNSEEN)
+async def retry(job_id: str, parts: PartsHere, who: Submitter) -> JobView | Response:
     """Do a failed or canceled job's unfinished tasks again, or a live one's failed tasks; what has completed stays."""
     await jobs.retry(parts.database, job_id, who.actor)
-    return await views.job_view(parts.database, job_id)
+    return await _seen(parts, job_id, who)
 
 
-@router.post("/jobs/{job_id}/requeue", responses=problems(404, 409, 422))
-async def requeue(job_id: str, wanted: RequeueRequest, parts: PartsHere, who: Submitter) -> JobView:
+@router.post("/jobs/{job_id}/requeue", response_model=JobView, responses=problems(404, 409, 422) | UNSEEN)
+async def requeue(job_id: str, wanted: RequeueRequest, parts: PartsHere, who: Submitter) -> JobView | Response:
     """Do tasks again though they are done, and all that follows from them; a completed job's artifacts go meanwhile."""
     await jobs.requeue(parts.database, job_id, wanted, who.actor)
-    return await views.job_view(parts.database, job_id)
+    return await _seen(parts, job_id, who)
 
 
-@router.post("/jobs/{job_id}/archive", responses=problems(404, 409))
-async def archive(job_id: str, parts: PartsHere, who: Submitter) -> JobView:
+@router.post("/jobs/{job_id}/archive", response_model=JobView, responses=problems(404, 409) | UNSEEN)
+async def archive(job_id: str, parts: PartsHere, who: Submitter) -> JobView | Response:
     """Put a job that is over aside: lists leave it out unless asked for."""
     await jobs.archive(parts.database, job_id, who.actor)
-    return await views.job_view(parts.database, job_id)
+    return await _seen(parts, job_id, who)
 
 
 @router.get("/jobs/{job_id}/tasks", dependencies=[Reader], responses=problems(404, 422))
@@ -225,6 +226,13 @@ async def artifact(job_id: str, name: str, request: Request, parts: PartsHere) -
     """Download an artifact, whole or a range of it."""
     found = await views.artifact(parts.database, job_id, name)
     return await serve_blob(request, parts.blobs, found.sha256, found.size, found.media_type)
+
+
+async def _seen(parts: Parts, job_id: str, who: Principal) -> JobView | Response:
+    """The job as it is now, where the caller may look at jobs."""
+    if not who.scopes & {Scope.READ, Scope.ADMIN}:
+        return Response(status_code=204)
+    return await views.job_view(parts.database, job_id)
 
 
 def _event_id(header: str | None) -> int:

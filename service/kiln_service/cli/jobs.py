@@ -4,11 +4,11 @@ import re
 from typing import Annotated, Final, Literal
 
 import typer
-from pydantic import ValidationError
 
 from kiln_schemas.client import Client
 from kiln_schemas.errors import InputError
 from kiln_schemas.job import JobChange, JobView, RequeueRequest, TaskView, read_labels
+from kiln_schemas.options import of_options
 from kiln_schemas.tasks import read_tags
 from kiln_service.cli import options
 from kiln_service.cli.output import print_json, results
@@ -42,7 +42,7 @@ def _act(action: Action):  # type: ignore[no-untyped-def]  # typer reads the par
         json: options.Json = False,
     ) -> None:
         with options.connect(url, token, data) as api:
-            _tell(api.act(job, action), json=json)
+            _tell(job, api.act(job, action), json=json)
 
     return command
 
@@ -65,15 +65,16 @@ def requeue(
     json: options.Json = False,
 ) -> None:
     """Do tasks again though they are done, and all that follows from them."""
-    wanted = {"kind": kind, "rows": _span(rows, "--rows"), "columns": _span(columns, "--columns"), "labels": task}
-    try:
-        request = RequeueRequest.model_validate(wanted)
-    except ValidationError:
-        raise InputError(
-            f"'{kind}' tasks are not done again", where="--kind", remedy="Choose render, fit, refine or package."
-        ) from None
+    request = of_options(
+        RequeueRequest,
+        {"kind": "--kind", "labels": "--task"},
+        kind=kind,
+        rows=_span(rows, "--rows"),
+        columns=_span(columns, "--columns"),
+        labels=task,
+    )
     with options.connect(url, token, data) as api:
-        _tell(api.requeue(job, request), json=json)
+        _tell(job, api.requeue(job, request), json=json)
 
 
 def change(
@@ -90,7 +91,7 @@ def change(
     labels = None if label is None else read_labels(label)
     wanted = JobChange(priority=priority, labels=labels, tags=None if tag is None else read_tags(tag))
     with options.connect(url, token, data) as api:
-        _tell(api.change(job, wanted), json=json)
+        _tell(job, api.change(job, wanted), json=json)
 
 
 def logs(
@@ -155,8 +156,13 @@ def _chosen(tasks: tuple[TaskView, ...], wanted: str | None) -> list[TaskView]:
     return found
 
 
-def _tell(view: JobView, *, json: bool) -> None:
-    if json:
+def _tell(job: str, view: JobView | None, *, json: bool) -> None:
+    if view is None:  # the token may not look at jobs
+        if json:
+            print_json({"id": job})
+        else:
+            results.print(f"{job}: done", markup=False)
+    elif json:
         print_json(view)
     else:
         results.print(f"{view.name}: {view.state.value}, priority {view.priority}", markup=False)
