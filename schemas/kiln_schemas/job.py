@@ -14,7 +14,7 @@ from kiln_schemas.gates import MOST_CAMERAS, Cameras, GateResult, Gates
 from kiln_schemas.settings import BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import MOST_NOTES, MOST_POINTS, PATH_LENGTH, Bundle, Progress, Sha256, Tags, TaskKind
-from kiln_schemas.text import LINE_BREAK, UNFIT, Line, Note, told
+from kiln_schemas.text import LINE_BREAK, UNFIT, Line, Note, is_line, told
 
 DEFAULT_PRIORITY: Final = 50
 
@@ -25,7 +25,8 @@ PART_BYTES: Final = 255
 """Longest name of a file or folder on the file systems in use."""
 LabelKey = Annotated[str, Field(pattern=LABEL_KEY, max_length=63)]
 LabelValue = Annotated[Line, Field(max_length=LABEL_LENGTH)]
-Labels = Annotated[dict[LabelKey, LabelValue], Field(max_length=32)]
+MOST_LABELS: Final = 32
+Labels = Annotated[dict[LabelKey, LabelValue], Field(max_length=MOST_LABELS)]
 
 
 class JobRequest(Contract):
@@ -181,13 +182,16 @@ def read_labels(words: Sequence[str], where: str = "--label") -> dict[str, str]:
     labels: dict[str, str] = {}
     for word in words:
         key, equals, value = word.partition("=")
-        if not equals or not re.fullmatch(LABEL_KEY, key) or len(value) > LABEL_LENGTH:
+        if not equals or not re.fullmatch(LABEL_KEY, key) or len(value) > LABEL_LENGTH or not is_line(value):
             raise InputError(
-                f"'{word}' is not a label",
+                f"'{told(word, 80)}' is not a label",
                 where=where,
-                remedy=f"Write KEY=VALUE: the key of letters, digits and . _ / -, the value of {LABEL_LENGTH} at most.",
+                remedy="Write KEY=VALUE: the key of letters, digits and . _ / -, the value on one line, of "
+                f"{LABEL_LENGTH} characters at most.",
             )
         labels[key] = value
+    if len(labels) > MOST_LABELS:
+        raise InputError(f"{len(labels)} labels are more than {MOST_LABELS}", where=where, remedy="Leave some out.")
     return labels
 
 

@@ -252,8 +252,12 @@ Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$", max_len
 Tags = Annotated[tuple[Tag, ...], Field(max_length=32)]
 
 
+NAME_LENGTH: Final = 128
+"""Of a worker's name, at most."""
+
+
 class WorkerRegistration(Contract):
-    name: Line = Field(min_length=1, max_length=128)
+    name: Line = Field(min_length=1, max_length=NAME_LENGTH)
     kinds: tuple[TaskKind, ...] = Field(min_length=1, max_length=32)
     memory_bytes: int = Field(gt=0, lt=2**63)
     threads: int = Field(gt=0, lt=2**31)

@@ -34,6 +34,11 @@ def quoted(text: str, length: int = QUOTE_LENGTH) -> str:
     return f"'{told(text, length)}'"
 
 
+def is_line(text: str) -> bool:
+    """Whether it is one line fit to be shown as it is."""
+    return not (UNFIT.search(text) or LINE_BREAK.search(text))
+
+
 def check_line(text: str) -> str:
     """The text unchanged, ValueError where it is not one line fit to be shown as it is."""
     found = UNFIT.search(text) or LINE_BREAK.search(text)

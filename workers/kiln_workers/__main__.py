@@ -14,18 +14,21 @@ import sys
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from kiln_schemas import program
 from kiln_schemas.errors import AuthError, InputError, KilnError, MachineLacks
 from kiln_schemas.files import read_small
 from kiln_schemas.logs import LogFormat, set_up
-from kiln_schemas.tasks import TaskKind, read_tags
+from kiln_schemas.tasks import NAME_LENGTH, TaskKind, read_tags
+from kiln_schemas.text import is_line, told
 from kiln_workers.compare.arguments import add_compare
 from kiln_workers.runner.machine import claim_folder, cores, default_memory_bytes, parse_size
 from kiln_workers.shade.arguments import add_commands
 
 log = logging.getLogger("kiln_workers")
+
+MOST_THREADS: Final = 4096
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -86,9 +89,11 @@ def _worker(options: argparse.Namespace) -> int:
     if not options.url:
         raise InputError("no coordinator is named", where="--url", remedy="Pass --url or set LIGHTKILN_URL.")
     token, kinds, threads = _token(options), _kinds(options.kinds), options.threads or cores()
-    if threads < 1:
-        raise InputError(f"{threads} threads are refused", where="--threads", remedy="Give 1 or more.")
+    if not 1 <= threads <= MOST_THREADS:
+        raise InputError(f"{threads} threads are refused", where="--threads", remedy=f"Give 1 to {MOST_THREADS}.")
     memory = parse_size(options.memory) if options.memory else default_memory_bytes()
+    if options.name is not None:
+        _check_name(options.name)
     folder, lock = claim_folder(options.scratch)
     structured = options.log_format == LogFormat.JSON
     announce = _print_json if options.json else Log() if structured else _print_line
@@ -149,6 +154,13 @@ def _token(options: argparse.Namespace) -> str:
     if not re.fullmatch(r"[\x21-\x7e]+", token):
         raise AuthError("the token has characters that no token has", where="--token", remedy=remedy)
     return token
+
+
+def _check_name(name: str) -> None:
+    if not 1 <= len(name) <= NAME_LENGTH or not is_line(name):
+        raise InputError(
+            f"'{told(name, 80)}' is refused", where="--name", remedy=f"Give 1 to {NAME_LENGTH} characters on one line."
+        )
 
 
 def _kinds(text: str) -> tuple[TaskKind, ...]:

@@ -35,6 +35,7 @@ from kiln_schemas.files import read_small
 from kiln_schemas.gates import GateResult, Gates, check_gates
 from kiln_schemas.job import JobRequest, JobView, TaskView
 from kiln_schemas.manifest import Manifest
+from kiln_schemas.options import of_options
 from kiln_schemas.settings import make_settings
 from kiln_schemas.states import PUBLISHED_JOB_STATES, JobState
 from kiln_service.cli.bundle import LocalBundle, collect
@@ -209,7 +210,9 @@ def _planned(options: BakeOptions) -> Record:
         scale=options.environment_scale,
         rotation_deg=options.environment_rotation_deg,
     )
-    request = JobRequest(
+    request = of_options(
+        JobRequest,
+        {"name": "SCENE", "set": "--set"},
         name=scene.stem[:128],
         bundle=local.bundle,
         preset=options.preset,

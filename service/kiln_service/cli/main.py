@@ -22,9 +22,11 @@ from kiln_schemas.errors import InputError, KilnError, MachineLacks
 from kiln_schemas.gates import check_gates, read_cameras, read_gates
 from kiln_schemas.job import DEFAULT_PRIORITY, JobRequest, JobView, read_labels
 from kiln_schemas.logs import LogFormat
+from kiln_schemas.options import check_key, of_options
 from kiln_schemas.settings import make_settings
 from kiln_schemas.states import FINAL_JOB_STATES, PUBLISHED_JOB_STATES, JobState
 from kiln_schemas.tasks import TaskKind, read_tags
+from kiln_schemas.text import told
 from kiln_service.cli import bake as baking
 from kiln_service.cli import options
 from kiln_service.cli.become import become
@@ -226,7 +228,11 @@ def submit(
     cameras = read_cameras(camera or ())
     gates = check_gates(read_gates(gate or ()), cameras)
     local = collect(scene, env, scale=env_scale, rotation_deg=env_rotation)
-    request = JobRequest(
+    if key is not None:
+        check_key(key, "--idempotency-key")
+    request = of_options(
+        JobRequest,
+        {"name": "--name", "set": "--set"},
         name=name or scene.stem[:128],
         bundle=local.bundle,
         preset=preset,
@@ -275,6 +281,9 @@ def status(
     """Show one job, or the newest ones."""
     with options.connect(url, token, data) as api:
         if job is None:
+            if text is not None and len(text) > 128:
+                raise InputError("is longer than 128 characters", where="--name", remedy="No job's name is as long.")
+            read_labels(label or ())
             page = api.jobs(labels=label or (), text=text, states=state or ())
             if json:
                 print_json(page)
@@ -432,9 +441,20 @@ def main() -> NoReturn:
         program.end(INTERRUPTED)
     except BrokenPipeError as error:
         sys.exit(program.output_lost(error))
+    except UnicodeEncodeError as error:
+        _leave(_not_text(error), as_json="--json" in sys.argv)
     except Exception as error:
         _leave(program.explained(error), as_json="--json" in sys.argv)
     program.end(0)
+
+
+def _not_text(error: UnicodeEncodeError) -> KilnError:
+    """Bytes of the command line that are no UTF-8, which Python holds as halves of surrogate pairs, or a defect."""
+    for before, word in zip(["", *sys.argv], sys.argv, strict=False):
+        if any("\ud800" <= letter <= "\udfff" for letter in word):
+            option = before if before.startswith("-") else word.partition("=")[0]
+            return InputError("is not UTF-8", where=told(option, 80), remedy="Write it in UTF-8.")
+    return program.explained(error)
 
 
 def _leave(error: KilnError, *, as_json: bool) -> NoReturn:

@@ -20,6 +20,7 @@ from kiln_schemas.operators import (
     WebhookRequest,
     WorkerView,
 )
+from kiln_schemas.options import of_options
 from kiln_service.cli import options
 from kiln_service.cli.output import notices, print_json, results
 
@@ -49,7 +50,7 @@ def collect_garbage(
 ) -> None:
     """Free what archived jobs have besides their packages: light fields and the data between tasks."""
     with options.connect(url, token, data) as api:
-        report = api.collect_garbage(GcRequest(days=days, dry_run=dry_run))
+        report = api.collect_garbage(of_options(GcRequest, {"days": "--days"}, days=days, dry_run=dry_run))
     if json:
         print_json(report)
         return
@@ -197,8 +198,9 @@ def create_token(
     json: options.Json = False,
 ) -> None:
     """Make an access token and print it, this once."""
+    request = of_options(TokenRequest, {"name": "NAME", "scopes": "--scope"}, name=name, scopes=tuple(scope))
     with options.connect(url, token, data) as api:
-        made = api.create_token(TokenRequest(name=name, scopes=tuple(scope)))
+        made = api.create_token(request)
     if json:
         print_json(made)
     else:

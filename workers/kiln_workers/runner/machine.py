@@ -24,7 +24,7 @@ SLOTS: Final = 1024
 def parse_size(text: str) -> int:
     """`4GiB`, `500 MB` or plain bytes, in bytes."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
-    if match is None or match[2] not in UNITS or float(match[1]) <= 0:
+    if match is None or match[2] not in UNITS or not 0 < float(match[1]) * UNITS[match[2]] < 2**63:
         raise InputError(f"'{text}' is not a size", where="--memory", remedy="Write it as 4GiB or 500MB.")
     return int(float(match[1]) * UNITS[match[2]])
 
