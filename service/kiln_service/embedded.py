@@ -162,10 +162,23 @@ class EmbeddedPostgres:
     def _make_folders(self) -> None:
         for folder in (self.folder, self._sockets):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if self._sockets != self.folder:
+            self._refuse_foreign(self._sockets)
         if self._user is not None:
             for folder in (self.folder, self._sockets):
                 os.chown(folder, self._user.pw_uid, self._user.pw_gid)
             self._bin = _reachable(self._bin, self._user)
+
+    def _refuse_foreign(self, folder: Path) -> None:
+        """MachineLacks where a folder under the system's temporary folder was made by somebody else."""
+        found = folder.lstat()
+        ours = {os.geteuid()} | ({self._user.pw_uid} if self._user is not None else set())
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid not in ours:
+            raise MachineLacks(
+                f"the database's socket would lie in a folder of user {found.st_uid}, or in a link",
+                where=str(folder),
+                remedy="Remove it, or choose a data folder with a shorter path.",
+            )
 
     def _make_cluster(self) -> None:
         """Run initdb in a folder beside the final one, so that a killed initdb leaves no half cluster."""

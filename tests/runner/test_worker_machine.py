@@ -95,3 +95,58 @@ def test_a_linked_blob_outlives_its_eviction(tmp_path: Path) -> None:
     cache.get(source.hashes[1])
     assert [path.name for path in cache.folder.iterdir()] == [source.hashes[1]]
     assert linked.read_bytes() == b"first" * 10
+
+
+def test_a_folder_that_others_may_have_made_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Links and another user's folder under the temporary folder; an open one of ours is closed."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    base, elsewhere = tmp_path / f"lightkiln-worker-{os.getuid()}", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    base.symlink_to(elsewhere)
+    with pytest.raises(MachineLacks, match=r"is a link.*--scratch"):
+        claim_folder()
+    assert list(elsewhere.iterdir()) == []
+    base.unlink()
+    base.mkdir(mode=0o777)
+    base.chmod(0o777)
+    folder, lock = claim_folder()
+    lock.close()
+    assert {path.stat().st_mode & 0o777 for path in (base, folder)} == {0o700}
+    folder.rmdir()
+    folder.symlink_to(elsewhere)
+    with pytest.raises(MachineLacks, match="is a link"):
+        claim_folder()
+    folder.unlink()
+    (base / "0.lock").unlink()
+    (base / "0.lock").symlink_to(elsewhere / "made")
+    with pytest.raises(MachineLacks, match="cannot be made"):
+        claim_folder()
+    assert list(elsewhere.iterdir()) == []
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root makes another user's folder")
+def test_a_folder_of_another_user_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    base = tmp_path / f"lightkiln-worker-{os.getuid()}"
+    base.mkdir(mode=0o700)
+    os.chown(base, 12345, 12345)
+    with pytest.raises(MachineLacks, match="owned by user 12345, not by 0"):
+        claim_folder()
+    with pytest.raises(MachineLacks, match="owned by user 12345"):
+        BlobCache(base, 100, Source().fetch)
+    assert list(base.iterdir()) == []
+
+
+def test_the_cache_follows_no_links(tmp_path: Path) -> None:
+    """A link in place of a blob is replaced, whatever it leads to; other links are neither counted nor removed."""
+    source = Source(b"a" * 100, b"b" * 100)
+    outside = tmp_path / "outside"
+    outside.write_bytes(b"a" * 100)
+    cache = BlobCache(tmp_path / "cache", 150, source.fetch)
+    (cache.folder / source.hashes[0]).symlink_to(outside)
+    (cache.folder / "other").symlink_to(outside)
+    assert not cache.get(source.hashes[0]).is_symlink() and source.asked == [b"a" * 100]
+    os.utime(cache.folder / source.hashes[0], (0, 0))
+    cache.get(source.hashes[1])
+    assert {path.name for path in cache.folder.iterdir()} == {source.hashes[1], "other"}
+    assert outside.read_bytes() == b"a" * 100

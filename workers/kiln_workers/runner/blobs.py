@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kiln_workers.runner.client import CHUNK
+from kiln_workers.runner.machine import own
 
 Fetch = Callable[[str, Path], None]
 """Downloads the blob of a hash to a path."""
@@ -21,15 +22,16 @@ class BlobCache:
 
     def __init__(self, folder: Path, limit_bytes: int, fetch: Fetch) -> None:
         self.folder, self.limit_bytes, self._fetch = folder, limit_bytes, fetch
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        own(folder)
 
     def get(self, sha256: str) -> Path:
         """A file with the blob's bytes; read it at once, or `link` it: a later `get` may evict it."""
         path = self.folder / sha256
-        if path.is_file() and file_sha256(path) == sha256:
+        if _is_file(path) and file_sha256(path) == sha256:
             os.utime(path)
             return path
-        path.unlink(missing_ok=True)
+        _remove(path)
         self._fetch(sha256, path)
         self._evict(keep=path)
         return path
@@ -45,7 +47,7 @@ class BlobCache:
         return target
 
     def _evict(self, keep: Path) -> None:
-        entries = sorted((p for p in self.folder.iterdir() if p.is_file()), key=lambda p: p.stat().st_mtime_ns)
+        entries = sorted((p for p in self.folder.iterdir() if _is_file(p)), key=lambda p: p.stat().st_mtime_ns)
         total = sum(p.stat().st_size for p in entries)
         for path in entries:
             if total <= self.limit_bytes:
@@ -53,6 +55,19 @@ class BlobCache:
             if path != keep:
                 total -= path.stat().st_size
                 path.unlink()
+
+
+def _is_file(path: Path) -> bool:
+    """Whether it is a file itself: a link is none, wherever it leads."""
+    return path.is_file() and not path.is_symlink()
+
+
+def _remove(path: Path) -> None:
+    """Remove what has a blob's name: a damaged file, a link, or a folder."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def file_sha256(path: Path) -> str:

@@ -3,6 +3,7 @@
 import fcntl
 import os
 import re
+import stat
 import tempfile
 from pathlib import Path
 from typing import IO, Final
@@ -54,20 +55,30 @@ def claim_folder(base: Path | None = None) -> tuple[Path, IO[bytes]]:
     """A folder that no other running worker uses, and the open lock that keeps it so.
 
     The folders of workers that were killed are used again, so what they left is bounded and their blob caches
-    stay of use. Made under `base`, or under the system's temporary folder.
+    stay of use. Made under `base`, or under the system's temporary folder, where others may have made a folder of this
+    name before us: MachineLacks where it, or a worker's folder in it, is a link or is not ours alone.
     """
+    temporary = base is None
     base = base or Path(tempfile.gettempdir()) / f"lightkiln-worker-{os.getuid()}"
     try:
         base.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if temporary:
+            own(base)
         for slot in range(SLOTS):
-            lock = (base / f"{slot}.lock").open("wb")
+            opened = os.open(base / f"{slot}.lock", os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            lock = os.fdopen(opened, "wb")
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 lock.close()
                 continue
             folder = base / str(slot)
-            folder.mkdir(exist_ok=True, mode=0o700)
+            try:
+                folder.mkdir(exist_ok=True, mode=0o700)
+                own(folder)
+            except BaseException:
+                lock.close()
+                raise
             return folder, lock
     except OSError as error:
         raise MachineLacks(
@@ -76,6 +87,22 @@ def claim_folder(base: Path | None = None) -> tuple[Path, IO[bytes]]:
             remedy="Free disk space, or name another folder with --scratch.",
         ) from None
     raise MachineLacks(f"{SLOTS} workers already use this folder", where=str(base), remedy="Pass another --scratch.")
+
+
+def own(folder: Path) -> None:
+    """Make a folder of ours private, mode 0700; MachineLacks where it is a link, no folder, or another user's."""
+    found = folder.lstat()
+    kind = "a link" if stat.S_ISLNK(found.st_mode) else None if stat.S_ISDIR(found.st_mode) else "no folder"
+    if kind is None and found.st_uid != os.geteuid():
+        kind = f"owned by user {found.st_uid}, not by {os.geteuid()}"
+    if kind is not None:
+        raise MachineLacks(
+            f"the worker's folder is {kind}, so others could read and change what is in it",
+            where=str(folder),
+            remedy="Remove it, or name another folder with --scratch.",
+        )
+    if stat.S_IMODE(found.st_mode) != 0o700:
+        folder.chmod(0o700)
 
 
 def _cgroup_value(name: str) -> str | None:
