@@ -9,6 +9,7 @@
     |-- Forbidden           the token lacks the scope (403, exit 6)
     |-- TooMany             the caller asks too often (429, exit 6)
     |-- NotFound            no such job, task, blob or artifact (404, exit 3)
+    |   `-- Damaged         a blob whose bytes are damaged or gone from the storage
     |-- Conflict            the request contradicts the present state (409, exit 4)
     |   |-- StaleAttempt    a worker acts under an attempt that was taken from it
     |   `-- IllegalTransition
@@ -18,6 +19,9 @@
     |-- Canceled            stopped on request (exit 5)
     |-- Unreachable         the coordinator does not answer (503, exit 6)
     |-- MachineLacks        libLLVM, disk, memory, database: what `lightkiln doctor` tells (507, exit 7)
+    |   |-- StoreLost       a light-field store is gone
+    |   `-- TilesLost       tiles of a light-field store are gone or damaged
+    |-- QuotaExceeded       a token has stored too much that no job uses (507, exit 6)
     `-- InternalError       a defect of ours (500, exit 1)
 
 A message names the place (mesh, file, field), the value and the remedy.
@@ -137,6 +141,10 @@ class NotFound(KilnError):
     code, title, status, exit_code = "not-found", "Not found", 404, 3
 
 
+class Damaged(NotFound):
+    code, title, retryable = "damaged", "Stored bytes are damaged or lost", True
+
+
 class Conflict(KilnError):
     code, title, status, exit_code = "conflict", "The request contradicts the present state", 409, 4
 
@@ -175,6 +183,26 @@ class Unreachable(KilnError):
 
 class MachineLacks(KilnError):
     code, title, status, exit_code, retryable = "machine-lacks", "This machine lacks something", 507, 7, True
+
+
+class StoreLost(MachineLacks):
+    code, title = "store-lost", "The light-field store is gone"
+
+
+class TilesLost(MachineLacks):
+    """`labels`: the labels of the render tasks whose tiles are lost."""
+
+    code, title = "tiles-lost", "Tiles of the light-field store are gone or damaged"
+
+    def __init__(
+        self, detail: str, *, where: str | None = None, remedy: str | None = None, labels: tuple[str, ...] = ()
+    ) -> None:
+        super().__init__(detail, where=where, remedy=remedy)
+        self.labels = labels
+
+
+class QuotaExceeded(KilnError):
+    code, title, status, exit_code, retryable = "quota", "The token has stored too much that no job uses", 507, 6, True
 
 
 class InternalError(KilnError):

@@ -80,6 +80,11 @@ class Tile(Contract):
     size: int = Field(ge=1, le=64)
     texels: int = Field(ge=0, le=TILE_TEXELS)
 
+    @property
+    def label(self) -> str:
+        """The label of the task that renders it."""
+        return f"tile {self.row},{self.column}"
+
 
 class PreparePayload(Contract):
     kind: Literal[TaskKind.PREPARE] = TaskKind.PREPARE
@@ -306,6 +311,10 @@ class HeartbeatReply(Contract):
     reason: Told = ""
 
 
+LOST_AT_ONCE: Final = 1024
+Labels = Annotated[tuple[Annotated[str, Field(max_length=64)], ...], Field(max_length=LOST_AT_ONCE)]
+
+
 class Commit(Contract):
     attempt: Number
     lease: Lease = ""
@@ -318,6 +327,8 @@ class Failure(Contract):
     problem: Problem
     retryable: bool
     log: Log = ""
+    lost: Labels = ()
+    """With the code `tiles-lost`: labels of the render tasks whose tiles are to be rendered again."""
 
 
 class Checkpoint(Contract):

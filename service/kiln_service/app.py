@@ -26,6 +26,7 @@ from kiln_service.api.common import PROBLEM_SCHEMA, Parts, caller, problem_answe
 from kiln_service.auth import TokenBook, own_token
 from kiln_service.blobs import Blobs
 from kiln_service.config import ServiceConfig
+from kiln_service.damage import make_again
 from kiln_service.db import Database
 from kiln_service.db.connection import Timeouts
 from kiln_service.db.migrate import migrate
@@ -100,7 +101,7 @@ async def _lifespan(app: FastAPI, config: ServiceConfig, tokens: TokenBook) -> A
     async with Database(config.database, config.pool_size, timing.database_s, timeouts) as database:
         await migrate(database)
         signals = Signals(database)
-        blobs = Blobs(database, config.blob_base, config.incoming, config.limits)
+        blobs = Blobs(database, config, functools.partial(make_again, database))
         work = Work(database, config, signals)
         app.state.parts = Parts(config, database, blobs, signals, work, tokens)
         background = [

@@ -2,35 +2,43 @@
 
 An upload grows in a temporary file, is hashed on the way, and becomes an object only when its hash is the
 promised one. The row in `blobs` is written last, after the object is durable (locally: fsync of the file and of the
-folder that names it; obstore does neither), so an object without a row is nothing and a row without an object
-does not happen. Publication and collection of the same blob exclude each other by an advisory lock on its hash.
+folder that names it; obstore does neither), so an object without a row is nothing. Publication and collection of the
+same blob exclude each other by an advisory lock on its hash.
+
+A disk may damage or lose an object later. Whole blobs are hashed again while they are sent, parts are checked by the
+object's size. A blob that is found damaged is marked: nobody is told any more that it is here, so whoever has the bytes
+uploads them again, and an upload always replaces the object. `on_damage` tells those who can make the bytes again
+(`kiln_service.damage`).
 """
 
 import asyncio
 import contextlib
 import hashlib
+import logging
 import os
-import shutil
 import tempfile
-from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Final
-from urllib.parse import unquote, urlparse
 
 import obstore
 import psycopg
 from obstore.exceptions import BaseError
 from obstore.store import ObjectStore, from_url
 
-from kiln_schemas.errors import DISK_FULL, InputError, MachineLacks, NotFound, TooLarge, Truncated, Unreachable
-from kiln_service.config import Limits
+from kiln_schemas.errors import DISK_FULL, Damaged, InputError, MachineLacks, NotFound, TooLarge, Truncated, Unreachable
+from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, Tx
+from kiln_service.disk import Disk, local_folder
 from kiln_service.ids import new_id
+from kiln_service.quota import Quota, Upload
 
 if TYPE_CHECKING:
     from obstore import GetResult
     from obstore.store import ClientConfig, RetryConfig, S3Config
+
+log = logging.getLogger(__name__)
 
 WRITE_BYTES: Final = 2**20
 """Uploads go to the disk in pieces of at least this size."""
@@ -53,37 +61,57 @@ def open_objects(url: str) -> ObjectStore:
     return from_url(url, config=config, client_options=options, retry_config=RETRIES)
 
 
+async def _nobody(sha256: str) -> None:
+    """There is nobody to be told of damage."""
+
+
 class Blobs:
     """The blobs of one coordinator."""
 
-    def __init__(self, database: Database, url: str, incoming: Path, limits: Limits) -> None:
+    def __init__(
+        self, database: Database, config: ServiceConfig, on_damage: Callable[[str], Awaitable[None]] = _nobody
+    ) -> None:
+        url = config.blob_base
         self._database = database
-        self._incoming = incoming
-        self._limits = limits
+        self._incoming = config.incoming
+        self._limits = config.limits
+        self._disk = Disk(config)
+        self._quota = Quota(database, config.limits)
+        self._on_damage = on_damage
         self._folder = local_folder(url)
         for folder in filter(None, (self._incoming, self._folder)):
             folder.mkdir(parents=True, exist_ok=True)
         self._objects: ObjectStore = open_objects(url)
 
-    async def receive(self, sha256: str, body: AsyncIterator[bytes], length: int | None) -> int:
-        """Take an upload whole or not at all; its size in bytes. `length` is the announced Content-Length."""
+    async def receive(self, sha256: str, body: AsyncIterator[bytes], length: int | None, token: str) -> int:
+        """Take an upload whole or not at all; its size in bytes. `length` is the announced Content-Length.
+
+        QuotaExceeded where the token of this name has stored too much that no job uses.
+        """
         self._check_size(length or 0)
-        with _no_space_is_507(self._incoming), self._temporary() as file:
-            digest, size = await self._drain(body, file)
-            if length is not None and size != length:
-                raise Truncated(
-                    f"the body has {size} bytes, Content-Length announced {length}",
-                    where=sha256,
-                    remedy="Upload the whole file again.",
-                )
-            if digest != sha256:
-                raise InputError(
-                    f"the bytes uploaded have sha256 {digest}",
-                    where=sha256,
-                    remedy="The file changed after it was hashed, or was damaged on the way: hash and upload it again.",
-                )
-            await asyncio.to_thread(_flush, file)
-            await self._publish(sha256, size, Path(file.name))
+        async with self._quota.upload(token) as upload:
+            self._quota.grow(upload, length or 0)
+            with _no_space_is_507(self._incoming), self._temporary() as file:
+                return await self._receive(sha256, body, length, upload, file)
+
+    async def _receive(
+        self, sha256: str, body: AsyncIterator[bytes], length: int | None, upload: Upload, file: IO[bytes]
+    ) -> int:
+        digest, size = await self._drain(body, file, upload)
+        if length is not None and size != length:
+            raise Truncated(
+                f"the body has {size} bytes, Content-Length announced {length}",
+                where=sha256,
+                remedy="Upload the whole file again.",
+            )
+        if digest != sha256:
+            raise InputError(
+                f"the bytes uploaded have sha256 {digest}",
+                where=sha256,
+                remedy="The file changed after it was hashed, or was damaged on the way: hash and upload it again.",
+            )
+        await asyncio.to_thread(_flush, file)
+        await self._publish(sha256, size, Path(file.name), upload.token)
         return size
 
     async def missing(self, hashes: Iterable[str]) -> list[str]:
@@ -94,46 +122,109 @@ class Blobs:
         return [sha256 for sha256 in wanted if sha256 not in here]
 
     async def size(self, sha256: str) -> int:
-        """Bytes of a blob; NotFound where it is not here."""
+        """Bytes of a blob; NotFound where it is not here, Damaged where its bytes are known to be damaged."""
         async with self._database.transaction() as tx:
             row = await tx.maybe("find_blob", sha256=sha256)
         if row is None:
             raise NotFound(f"no blob {sha256}", where="blobs")
+        if row["damaged"]:
+            await self._on_damage(sha256)
+            raise _damaged(sha256)
         return int(row["size"])
 
     async def read(self, sha256: str, start: int, end: int) -> AsyncIterator[bytes]:
-        """Bytes start..end-1 of a blob in pieces; Unreachable or NotFound where they are not to be had."""
+        """Bytes start..end-1 of a blob in pieces; Unreachable, NotFound or Damaged where they are not to be had.
+
+        Where they are all of the blob, its last piece comes only if their hash is right.
+        """
+        size = await self.size(sha256)
         if start == end:
             return _nothing()
         try:
             with _storage_errors():
                 result = await obstore.get_async(self._objects, _key(sha256), options={"range": (start, end)})
-        except FileNotFoundError:
-            raise NotFound(
-                f"the storage has lost blob {sha256}", where="storage", remedy="Restore the blobs from a backup."
-            ) from None
-        return _pieces(result)
+        except (FileNotFoundError, Unreachable):
+            await self._doubt(sha256)
+            raise
+        if result.meta["size"] != size:
+            await self._doubt(sha256)
+        return self._checked(sha256, result) if (start, end) == (0, size) else _pieces(result)
 
     async def read_parts(self, sha256: str, starts: Sequence[int], length: int) -> list[bytes]:
         """So many bytes of a blob from each of these places on."""
-        with _storage_errors():
-            parts = await obstore.get_ranges_async(
-                self._objects, _key(sha256), starts=starts, lengths=[length] * len(starts), coalesce=READ_GAP
-            )
+        try:
+            with _storage_errors():
+                parts = await obstore.get_ranges_async(
+                    self._objects, _key(sha256), starts=starts, lengths=[length] * len(starts), coalesce=READ_GAP
+                )
+        except (FileNotFoundError, Unreachable):
+            await self._doubt(sha256)
+            raise
         return [bytes(part) for part in parts]
 
-    async def take(self, body: AsyncIterator[bytes]) -> str:
+    async def _checked(self, sha256: str, result: "GetResult") -> AsyncIterator[bytes]:
+        """A whole blob's pieces; the last one is held back until the hash of all is known to be right."""
+        digest, held = hashlib.sha256(), b""
+        async for piece in _pieces(result):
+            if held:
+                yield held
+            held = piece
+            await asyncio.to_thread(digest.update, piece)
+        if digest.hexdigest() != sha256:
+            await self._doubt(sha256)
+            raise Unreachable(f"blob {sha256} was read wrong once", where="storage")
+        yield held
+
+    async def _doubt(self, sha256: str) -> None:
+        """Read a blob again; Damaged where its bytes are not what was uploaded, which is noted.
+
+        An upload may replace the object meanwhile: the mark is for the object that was read.
+        """
+        bad, version = await self._examine(sha256)
+        if not bad:
+            return
+        async with self._database.transaction() as tx:
+            await tx.run("lock_blob", sha256=sha256)
+            if await self._version(sha256) != version:
+                return
+            await tx.run("mark_damaged", sha256=sha256)
+        log.error("the bytes of blob %s are damaged or gone", sha256)
+        await self._on_damage(sha256)
+        raise _damaged(sha256)
+
+    async def _examine(self, sha256: str) -> tuple[bool, str | None]:
+        """Whether the bytes of an object are wrong, and the version of it that was read; None where there is none."""
+        digest = hashlib.sha256()
+        try:
+            with _storage_errors():
+                result = await obstore.get_async(self._objects, _key(sha256))
+                async for piece in _pieces(result):
+                    await asyncio.to_thread(digest.update, piece)
+        except FileNotFoundError:
+            return True, None
+        return digest.hexdigest() != sha256, result.meta["e_tag"]
+
+    async def _version(self, sha256: str) -> str | None:
+        try:
+            with _storage_errors():
+                return (await obstore.head_async(self._objects, _key(sha256)))["e_tag"]
+        except FileNotFoundError:
+            return None
+
+    async def take(self, body: AsyncIterator[bytes], token: str) -> str:
         """Take an upload whose hash nobody has told; its sha256."""
         self._check_size(0)
-        with _no_space_is_507(self._incoming), self._temporary() as file:
-            digest, size = await self._drain(body, file)
-            await asyncio.to_thread(_flush, file)
-            await self._publish(digest, size, Path(file.name))
+        async with self._quota.upload(token) as upload:
+            with _no_space_is_507(self._incoming), self._temporary() as file:
+                digest, size = await self._drain(body, file, upload)
+                await asyncio.to_thread(_flush, file)
+                await self._publish(digest, size, Path(file.name), token)
         return digest
 
     async def collect(self, grace_s: float) -> int:
         """Delete blobs that nothing uses and nobody asked for within the grace period; how many."""
         async with self._database.transaction() as tx:
+            await tx.run("recount_uses")
             candidates = [row["sha256"] for row in await tx.all("unused_blobs", seconds=grace_s)]
         collected = 0
         for sha256 in candidates:
@@ -173,16 +264,9 @@ class Blobs:
                 where="blob",
                 remedy="Raise limits.blob_bytes of the coordinator.",
             )
-        for folder in filter(None, (self._incoming, self._folder)):
-            free = shutil.disk_usage(folder).free
-            if free < size + self._limits.reserve_bytes:
-                raise MachineLacks(
-                    f"{free} bytes are free, {size} and a reserve of {self._limits.reserve_bytes} are needed",
-                    where=str(folder),
-                    remedy="Free disk space on the coordinator's machine.",
-                )
+        self._disk.require(size)
 
-    async def _drain(self, body: AsyncIterator[bytes], file: IO[bytes]) -> tuple[str, int]:
+    async def _drain(self, body: AsyncIterator[bytes], file: IO[bytes], upload: Upload) -> tuple[str, int]:
         """Write and hash the body in a thread, in large pieces; its sha256 and size."""
         digest, size = hashlib.sha256(), 0
         pieces: list[bytes] = []
@@ -195,6 +279,7 @@ class Blobs:
         async for piece in body:
             pieces.append(piece)
             held, size = held + len(piece), size + len(piece)
+            self._quota.grow(upload, size)
             if held >= WRITE_BYTES:
                 self._check_size(size)
                 await asyncio.to_thread(write, b"".join(pieces))
@@ -202,25 +287,17 @@ class Blobs:
         await asyncio.to_thread(write, b"".join(pieces))
         return digest.hexdigest(), size
 
-    async def _publish(self, sha256: str, size: int, file: Path) -> None:
+    async def _publish(self, sha256: str, size: int, file: Path, token: str) -> None:
+        """Make the object durable, in place of one that may be there and damaged, and vouch for it."""
         if self._folder is None:
             await self._put(sha256, file)  # before the transaction: a slow bucket must not use up the connections
         async with self._database.transaction() as tx:
             await tx.run("lock_blob", sha256=sha256)
-            if not await tx.all("touch_blobs", hashes=[sha256]):
-                await self._place(sha256, file)
-                await tx.run("insert_blob", sha256=sha256, size=size)
-
-    async def _place(self, sha256: str, file: Path) -> None:
-        """Make the object durable; the blob is locked."""
-        if self._folder is not None:
-            await asyncio.to_thread(_move_durably, file, self._folder / _key(sha256))
-            return
-        try:
-            with _storage_errors():
-                await obstore.head_async(self._objects, _key(sha256))
-        except FileNotFoundError:  # collected after it was put and before it was locked
-            await self._put(sha256, file)
+            if self._folder is not None:
+                await asyncio.to_thread(_move_durably, file, self._folder / _key(sha256))
+            elif await self._version(sha256) is None:  # collected after it was put and before it was locked
+                await self._put(sha256, file)
+            await tx.run("store_blob", sha256=sha256, size=size, uploader=token)
 
     async def _put(self, sha256: str, file: Path) -> None:
         with _storage_errors():
@@ -236,10 +313,15 @@ class Blobs:
                 Path(file.name).unlink(missing_ok=True)
 
 
+async def hold_blobs(tx: Tx, hashes: Iterable[str]) -> dict[str, int]:
+    """The sizes of those blobs that are here and whole; none is collected before the transaction ends."""
+    return {row["sha256"]: row["size"] for row in await tx.all("hold_blobs", hashes=sorted(set(hashes)))}
+
+
 async def require_blobs(tx: Tx, hashes: Iterable[str]) -> list[str]:
     """Those of the hashes that are not here, the others locked against collection until the transaction ends."""
     wanted = sorted(set(hashes))
-    here = {row["sha256"] for row in await tx.all("hold_blobs", hashes=wanted)}
+    here = await hold_blobs(tx, wanted)
     return [sha256 for sha256 in wanted if sha256 not in here]
 
 
@@ -251,6 +333,14 @@ async def use_blobs(tx: Tx, owner: str, hashes: Iterable[str]) -> None:
 async def drop_blobs(tx: Tx, *owners: str) -> None:
     """`owners` no longer use any blob."""
     await tx.run("drop_blob_uses", owners=list(owners))
+
+
+def _damaged(sha256: str) -> Damaged:
+    return Damaged(
+        f"the storage has lost blob {sha256} or damaged it",
+        where="storage",
+        remedy="Upload the file again, do the task that made it again, or restore the blobs from a backup.",
+    )
 
 
 async def _nothing() -> AsyncIterator[bytes]:
@@ -285,12 +375,6 @@ def _first_line(error: Exception) -> str:
 
 def _key(sha256: str) -> str:
     return f"{sha256[:2]}/{sha256}"
-
-
-def local_folder(url: str) -> Path | None:
-    """The folder of a file:// URL, None for other storage."""
-    parts = urlparse(url)
-    return Path(unquote(parts.path)) if parts.scheme == "file" else None
 
 
 def _flush(file: IO[bytes]) -> None:

@@ -88,7 +88,11 @@ class Limits(Contract):
     body_bytes: Bound = 16 * 2**20
     """Largest body of any request but a blob upload."""
     reserve_bytes: int = Field(default=256 * 2**20, ge=0, lt=2**63)
-    """Uploads are refused when the disk would have less free space than this."""
+    """While the disk has less free space than this, nothing is taken that grows (`kiln_service.disk`)."""
+    unused_bytes: Bound = 64 * 2**30
+    """Most bytes of blobs that one token has uploaded and no job uses."""
+    unused_blobs: Bound = 20_000
+    """Most such blobs."""
     page: Bound = 200
     """Most jobs on a page."""
     tiles: int = Field(default=MOST_TILES, gt=0, le=MOST_TILES)

@@ -14,9 +14,10 @@ from psycopg.types.json import Jsonb
 
 from kiln_schemas.operators import Freed, GcReport
 from kiln_schemas.states import JobState
-from kiln_service.blobs import local_folder, open_objects
+from kiln_service.blobs import open_objects
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, Tx
+from kiln_service.disk import local_folder
 from kiln_service.jobs import lock_job
 from kiln_service.operators import record
 

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Set
+from typing import Final
 
 from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
@@ -16,9 +17,16 @@ from kiln_service import queue, transitions
 from kiln_service.auth import Principal
 from kiln_service.blobs import require_blobs, use_blobs
 from kiln_service.config import ServiceConfig
+from kiln_service.damage import redo_damaged
 from kiln_service.db import Database, JobRow, Tx
+from kiln_service.disk import Disk
 from kiln_service.events import add_event
+from kiln_service.lost_renders import redo_seen
 from kiln_service.planner import METHODS, SG_LIGHTFIELD, plan_job
+from kiln_service.stores import Look, look_for_renders
+
+REOPENED_JOB_STATES: Final = frozenset({JobState.FAILED, JobState.CANCELED})
+"""Those of a job that is over and did not come to its end: it may be taken up again."""
 
 
 def settings_of(request: JobRequest) -> BakeSettings:
@@ -45,6 +53,7 @@ async def submit(
     settings = settings_of(request)
     bundle = check_bundle(request.bundle)
     gates = check_gates(request.gates, request.cameras)
+    Disk(config).require()
     async with database.transaction() as tx:
         if (earlier := await _submitted(tx, submission)) is not None:
             return earlier
@@ -126,13 +135,18 @@ async def resume(database: Database, job_id: str, actor: str) -> None:
         await transitions.resume_job(tx, job, actor)
 
 
-async def retry(database: Database, job_id: str, actor: str) -> None:
-    """Do a failed or canceled job's unfinished tasks again, or the failed ones of a job that goes on without them."""
+async def retry(database: Database, config: ServiceConfig, job_id: str, actor: str) -> None:
+    """Do a failed or canceled job's unfinished tasks again, or the failed ones of a job that goes on without them.
+
+    What a job that is over has lost meanwhile (light fields, blobs of results) is made again as well.
+    """
+    found = await _look(database, config, job_id)
     async with database.transaction() as tx:
         job = await lock_job(tx, job_id)
-        _require(job, {*LIVE_JOB_STATES, JobState.FAILED, JobState.CANCELED}, "retried")
-        kinds = {TaskKind(row["kind"]) for row in await tx.all("unfinished_kinds", job_id=job.id)}
-        stage = next((stage for stage in METHODS[job.method].stages if stage in kinds), None)
+        _require(job, {*LIVE_JOB_STATES, *REOPENED_JOB_STATES}, "retried")
+        if job.state in REOPENED_JOB_STATES:
+            job = await restore(tx, config, job, found)
+        stage = await _first_unfinished(tx, job)
         if stage is None:
             raise Conflict(
                 f"job {job_id} has no unfinished task: {job.error.sentence() if job.error else job.state}",
@@ -143,15 +157,46 @@ async def retry(database: Database, job_id: str, actor: str) -> None:
             if not await transitions.reopen_tasks(tx, job, stage, [TaskState.FAILED], actor):
                 raise Conflict(f"job {job_id} is {job.state}, and none of its tasks has failed", where="job")
             return
-        job = await transitions.move_job(tx, job, JobState.QUEUED, actor)
-        await transitions.reopen_tasks(tx, job, stage, [TaskState.FAILED, TaskState.CANCELED], actor)
+        await _reopen(tx, job, stage, actor)
 
 
-async def requeue(database: Database, job_id: str, wanted: RequeueRequest, actor: str) -> None:
-    """Do tasks again that are done, and all that follows from them; what a completed job had published is gone."""
+async def _first_unfinished(tx: Tx, job: JobRow) -> TaskKind | None:
+    """The first stage of a locked job with tasks that have not completed."""
+    kinds = {TaskKind(row["kind"]) for row in await tx.all("unfinished_kinds", job_id=job.id)}
+    return next((stage for stage in METHODS[job.method].stages if stage in kinds), None)
+
+
+async def _look(database: Database, config: ServiceConfig, job_id: str) -> Look:
+    """What is left of a job's light fields; before any lock, as it may take seconds."""
+    row = await database.first("find_job", id=job_id)
+    if row is None:
+        raise NotFound(f"no job '{job_id}'", where="job")
+    return await look_for_renders(config, database, JobRow.of(row))
+
+
+async def restore(tx: Tx, config: ServiceConfig, job: JobRow, found: Look) -> JobRow:
+    """Have a locked job make again what it has lost; Damaged where that is a file that only the client has."""
+    job = await redo_seen(tx, config, job, found)
+    if (error := await redo_damaged(tx, job)) is not None:
+        raise error
+    return job
+
+
+async def _reopen(tx: Tx, job: JobRow, stage: TaskKind, actor: str) -> None:
+    """A failed or canceled job goes on with the stage that it has come to."""
+    job = await transitions.move_job(tx, job, JobState.QUEUED, actor)
+    await transitions.reopen_tasks(tx, job, stage, [TaskState.FAILED, TaskState.CANCELED], actor)
+
+
+async def requeue(database: Database, config: ServiceConfig, job_id: str, wanted: RequeueRequest, actor: str) -> None:
+    """Do tasks again that are done, and all that follows from them; what a completed job had published is gone.
+
+    A job that is over goes on with them, and makes again what it has lost meanwhile.
+    """
+    found = await _look(database, config, job_id)
     async with database.transaction() as tx:
         job = await lock_job(tx, job_id)
-        _require(job, LIVE_JOB_STATES | PUBLISHED_JOB_STATES, "requeued")
+        _require(job, LIVE_JOB_STATES | PUBLISHED_JOB_STATES | {JobState.FAILED}, "requeued")
         stages = METHODS[job.method].stages
         later = stages[stages.index(wanted.kind) + 1 :]
         rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[wanted.kind.value])
@@ -162,17 +207,25 @@ async def requeue(database: Database, job_id: str, wanted: RequeueRequest, actor
                 where="requeue",
                 remedy="GET .../tasks lists them with their labels.",
             )
-        if not (redone := await transitions.redo_tasks(tx, job, chosen, TaskState.QUEUED)):
+        redone = await transitions.redo_tasks(tx, job, chosen, TaskState.QUEUED)
+        if not redone and job.state is not JobState.FAILED:
             raise Conflict(f"the {wanted.kind} tasks of job {job_id} are not done yet", where="job")
         rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[kind.value for kind in later])
         waiting = await transitions.redo_tasks(tx, job, [row["id"] for row in rows], TaskState.WAITING)
         await tx.run("delete_artifacts", job_id=job.id)
+        if job.state not in LIVE_JOB_STATES:
+            job = await restore(tx, config, job, found)
         detail = wanted.model_dump(mode="json", exclude_none=True) | {"count": redone, "waiting": waiting}
         await add_event(tx, job.id, "tasks.requeued", actor, detail=detail)
         if job.state in PUBLISHED_JOB_STATES:
             await tx.run("set_gate_results", id=job.id, results=Jsonb([]))
             await transitions.move_job(tx, job, JobState.QUEUED, actor)
-        await queue.announce(tx, [wanted.kind])
+        first = await _first_unfinished(tx, job)
+        assert first is not None, "what is done again is unfinished"
+        if job.state is JobState.FAILED:
+            await _reopen(tx, job, first, actor)
+        await transitions.hold_later(tx, job, first)
+        await queue.announce(tx, [first])
 
 
 def _is_wanted(row: DictRow, wanted: RequeueRequest) -> bool:

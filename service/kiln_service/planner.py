@@ -76,7 +76,7 @@ def plan_after_prepare(result: PrepareResult, settings: BakeSettings, gates: Gat
             remedy="Leave the gate out, or pass an environment with --env.",
         )
     renders = [
-        Planned(TaskKind.RENDER, f"tile {tile.row},{tile.column}", {"tile": tile.model_dump(mode="json")}, ready=True)
+        Planned(TaskKind.RENDER, tile.label, {"tile": tile.model_dump(mode="json")}, ready=True)
         for tile in sorted(result.tiles, key=lambda tile: (tile.row, tile.column))
     ]
     functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if result.has_environment else [])

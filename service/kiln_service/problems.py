@@ -197,7 +197,7 @@ class SecurityHeaders:
 
 
 class LastResort:
-    """Answer 500 with an id that is in the log, for whatever no handler knew."""
+    """Answer 500 with an id that is in the log, for whatever no handler knew; end an answer that cannot go on."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -215,15 +215,19 @@ class LastResort:
             return
         try:
             await self._app(scope, receive, watched)
-        except Exception:
+        except Exception as error:
+            known = error if isinstance(error, KilnError) else error.__cause__
+            if started and isinstance(known, KilnError):
+                # The server closes a connection whose answer is not complete.
+                log.error("the answer to %s %s breaks off: %s", scope["method"], scope["path"], known)
+                return
             defect = new_id()
             log.exception("defect %s in %s %s", defect, scope["method"], scope["path"])
             if started:
                 raise
-            error = InternalError(
-                f"defect {defect}", remedy="Look the number up in the coordinator's log and report what it says."
-            )
-            await answer(Request(scope), error.problem())(scope, receive, send)
+            remedy = "Look the number up in the coordinator's log and report what it says."
+            problem = InternalError(f"defect {defect}", remedy=remedy).problem()
+            await answer(Request(scope), problem)(scope, receive, send)
 
 
 class Authentication:

@@ -29,7 +29,7 @@ from kiln_service.blobs import drop_blobs
 from kiln_service.db import JobRow, TaskRow, Tx, WorkerRow
 from kiln_service.events import add_event
 from kiln_service.ids import new_id
-from kiln_service.planner import Planned
+from kiln_service.planner import METHODS, Planned
 
 COORDINATOR: Final = "coordinator"
 """The actor of what nobody asked for."""
@@ -250,6 +250,49 @@ async def redo_tasks(tx: Tx, job: JobRow, ids: Sequence[str], after: TaskState) 
     await tx.run("forget_task_failures", ids=moved)
     await drop_blobs(tx, *(f"{use}:{task_id}" for use in ("checkpoint", "result") for task_id in moved))
     return len(moved)
+
+
+async def redo_lost(tx: Tx, job: JobRow, lost: Sequence[tuple[str, TaskKind]], reason: str) -> int:
+    """What these tasks (id, kind) of a locked job had made is gone: they are done again; how many.
+
+    Tasks of later stages wait for them and keep their checkpoints: what is made again has the same bytes. Of those that
+    completed, only what a network's weights led to is done again, as its bytes depend on the machine that trains it.
+    """
+    stages = METHODS[job.method].stages
+    first = min(stages.index(kind) for _, kind in lost)
+    later = stages[first + 1 :]
+    count = await redo_tasks(tx, job, [task_id for task_id, _ in lost], TaskState.WAITING)
+    if stages[first] in (TaskKind.FIT, TaskKind.REFINE):
+        rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[kind.value for kind in later])
+        await redo_tasks(tx, job, [row["id"] for row in rows], TaskState.WAITING)
+    await hold_later(tx, job, stages[first])
+    await add_event(tx, job.id, "tasks.lost", COORDINATOR, detail={"count": count, "reason": reason})
+    await release_first_stage(tx, job)
+    return count
+
+
+async def hold_later(tx: Tx, job: JobRow, stage: TaskKind) -> None:
+    """queued, soft-failed, active > waiting: the tasks of all stages after one; they keep their checkpoints."""
+    before = CLAIMABLE_TASK_STATES | {TaskState.ACTIVE}
+    for state in before:
+        check_task_move(state, TaskState.WAITING)
+    stages = METHODS[job.method].stages
+    kinds = [kind.value for kind in stages[stages.index(stage) + 1 :]]
+    await tx.run("hold_tasks", job_id=job.id, kinds=kinds, before=[state.value for state in before])
+
+
+async def release_first_stage(tx: Tx, job: JobRow) -> None:
+    """waiting > queued: the tasks of the first stage of a job that is not completed."""
+    for stage in METHODS[job.method].stages:
+        if (await tx.one("stage_left", job_id=job.id, kind=stage))["unfinished"]:
+            await release_tasks(tx, job, stage)
+            return
+
+
+async def render_into_own_store(tx: Tx, job: JobRow, store_url: str) -> JobRow:
+    """The job no longer reads another job's light fields."""
+    await tx.run("share_renders", id=job.id, source=None, store_url=store_url)
+    return replace(job, store_url=store_url, renders_of=None)
 
 
 async def forgive_worker(tx: Tx, job: JobRow, kind: TaskKind, worker: str, max_attempts: int) -> list[str]:

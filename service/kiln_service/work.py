@@ -37,20 +37,21 @@ from kiln_schemas.tasks import (
     TaskKind,
     WorkerRegistration,
 )
-from kiln_service import queue, transitions
+from kiln_service import lost_renders, queue, transitions
 from kiln_service.auth import digest_of
 from kiln_service.batches import Batches
-from kiln_service.blobs import drop_blobs, require_blobs, use_blobs
+from kiln_service.blobs import drop_blobs, hold_blobs, use_blobs
 from kiln_service.blocks import note_failure
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, JobRow, TaskRow, Tx, WorkerRow, fetched, readable
+from kiln_service.disk import Disk
 from kiln_service.events import QUEUED_CHANNEL, Signals, add_event, wait
 from kiln_service.ids import new_id
 from kiln_service.jobs import settle_cancel
 from kiln_service.operators import OFFLINE_S
 from kiln_service.payloads import build_payload
 from kiln_service.planner import METHODS, plan_after_prepare
-from kiln_service.reuse import renders_to_reuse
+from kiln_service.reuse import check_sources, renders_to_reuse
 
 RELEASED_CODE: Final = "canceled"
 """A worker that leaves in good order gives its task back with this code; that is no strike against the task."""
@@ -61,6 +62,7 @@ class Work:
 
     def __init__(self, database: Database, config: ServiceConfig, signals: Signals) -> None:
         self._database, self._config, self._signals = database, config, signals
+        self._disk = Disk(config)
         self._claims = Batches(database, self._claim_all)
         self._renders = Batches(database, self._commit_renders)
 
@@ -132,7 +134,7 @@ class Work:
             worker = await _find_worker(tx, worker_id, owner)
             if worker.orders == "drain":
                 raise Drained("an operator told the worker to leave", where=worker.name)
-            rests = worker.orders == "sleep" or worker.asleep
+            rests = worker.orders == "sleep" or worker.asleep or self._disk.shortage() is not None
             job_id = None if rests else await queue.look(tx, worker, kinds, stale_s)
             if job_id is None:
                 await tx.run("see_worker_lightly", id=worker_id)
@@ -174,7 +176,7 @@ class Work:
             task_id=beat.task_id,
             attempt=beat.attempt,
             lease_sha256=digest_of(beat.lease),
-            lines=beat.log,
+            lines=beat.log if self._disk.shortage() is None else "",
             progress=Jsonb(progress.model_dump(mode="json")) if progress else None,
             step=progress.done if progress else None,
             loss=progress.loss if progress else None,
@@ -212,6 +214,9 @@ class Work:
             job_id = await job_of(self._database, task_id)
             if await self._renders.ask(job_id, (task_id, commit)):
                 return
+        sources: Sequence[str] = ()
+        if isinstance(commit.result, PrepareResult):
+            sources = await check_sources(self._database, self._config, task_id, commit.result)
         stopped: StaleAttempt | None = None
         async with locked_task(self._database, task_id) as (tx, job, task):
             if _is_repeated(task, commit):
@@ -223,7 +228,7 @@ class Work:
                 await transitions.cancel_task(tx, task, transitions.COORDINATOR, stopped.detail)
                 await settle_cancel(tx, job)
             else:
-                await self._accept(tx, job, task, commit.result)
+                await self._accept(tx, job, task, commit.result, sources)
         if stopped:
             raise stopped
 
@@ -254,13 +259,17 @@ class Work:
             await _fan_in(tx, job, *rendered)
         return answers
 
-    async def _accept(self, tx: Tx, job: JobRow, task: TaskRow, result: Result) -> None:
-        """Complete the task, publish what it made, and go on with the job."""
+    async def _accept(self, tx: Tx, job: JobRow, task: TaskRow, result: Result, sources: Sequence[str]) -> None:
+        """Complete the task, publish what it made, and go on with the job; `sources` may be reused."""
         if made := _blobs_of(result):
-            await _require(tx, made)
+            sizes = await _require(tx, made)
+            if isinstance(result, PackageResult):
+                _check_sizes(result, sizes)
             await use_blobs(tx, f"result:{task.id}", made)
         await transitions.complete_task(tx, task, result)
-        if isinstance(result, PrepareResult):
+        if isinstance(result, PrepareResult) and job.prepared is not None:
+            _check_same(job, result)
+        elif isinstance(result, PrepareResult):
             await tx.run("add_notes", id=job.id, notes=Jsonb(list(result.notes)))
             prepared = result.model_dump(mode="json", exclude={"tiles"})
             await tx.run("set_prepared", id=job.id, prepared=Jsonb(prepared))
@@ -269,7 +278,7 @@ class Work:
             except InputError as error:
                 await transitions.fail_job(tx, job, error.problem(), transitions.COORDINATOR)
                 return
-            source = await renders_to_reuse(tx, job, result)
+            source = await renders_to_reuse(tx, job, result, sources)
             if source is None:
                 await transitions.add_tasks(tx, job, planned)
             else:
@@ -285,9 +294,15 @@ class Work:
 
     async def fail(self, task_id: str, failure: Failure) -> None:
         """An attempt ended without a result: another may try, or the task fails."""
+        lost = await lost_renders.believed(self._database, self._config, task_id, failure)
         async with locked_task(self._database, task_id) as (tx, job, task):
             _check_fence(task, failure)
-            await _add_log(tx, task.id, failure.attempt, failure.log)
+            await _add_log(tx, task.id, failure.attempt, failure.log if self._disk.shortage() is None else "")
+            if lost is not None and job.state in LIVE_JOB_STATES and task.strikes + 1 < self._config.max_attempts:
+                actor, reason = f"worker:{task.worker_id}", failure.problem.sentence()
+                await transitions.requeue_task(tx, task, "task.retried", actor, strike=True, reason=reason)
+                await lost_renders.redo(tx, self._config, job, lost)
+                return
             await self.end_attempt(
                 tx,
                 job,
@@ -458,12 +473,37 @@ def _blobs_of(result: Result) -> list[str]:
             return []
 
 
-async def _require(tx: Tx, hashes: Sequence[str]) -> None:
-    if absent := await require_blobs(tx, hashes):
+async def _require(tx: Tx, hashes: Sequence[str]) -> dict[str, int]:
+    """Sizes of blobs, which are kept until the transaction ends; Conflict where one is not here."""
+    sizes = await hold_blobs(tx, hashes)
+    if absent := sorted(set(hashes) - sizes.keys()):
         raise Conflict(
             f"blobs were not uploaded: {', '.join(absent)}",
             where="blobs",
             remedy="PUT them to /v1/blobs/{sha256} and repeat the call.",
+        )
+    return sizes
+
+
+def _check_sizes(result: PackageResult, sizes: dict[str, int]) -> None:
+    """InputError where an artifact has another size than its blob: it could never be downloaded."""
+    for artifact in result.artifacts:
+        if artifact.size != sizes[artifact.sha256]:
+            raise InputError(
+                f"it is said to have {artifact.size} bytes, its blob has {sizes[artifact.sha256]}",
+                where=f"result.artifacts: {artifact.name}",
+            )
+
+
+def _check_same(job: JobRow, result: PrepareResult) -> None:
+    """InputError where a scene that was prepared again came out as another one: its tiles would not fit together."""
+    again = result.model_dump(mode="json")
+    changed = [name for name in ("scene_hash", "texel_map") if (job.prepared or {}).get(name) != again[name]]
+    if changed:
+        raise InputError(
+            f"the scene was prepared again and its {' and '.join(changed)} changed",
+            where="prepare",
+            remedy="Submit the job anew: its worker's libraries are of other versions than those that began it.",
         )
 
 

@@ -48,7 +48,7 @@ def kept_bake(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = StoreSource(store, Function.LIGHT_FIELD, texel_map.state, texel_map.normal, prepared.tiles)
     layers, _ = lobes_to_layers(np.tile(np.array([0, 1, 0, 1, 0, 0, 0], np.float32), (*texel_map.state.shape, 1, 1)))
     ktx2.write(folder / conventions.LIGHT_FIELD_KTX2, ktx2.texture_array(layers, {}))
-    exr.write_rgb(folder / conventions.IRRADIANCE_EXR, store.read_irradiance())
+    exr.write_rgb(folder / conventions.IRRADIANCE_EXR, store.read_irradiance(prepared.tiles))
     (folder / conventions.SCENE_GLB).write_bytes(encode_glb(unpack_scene(context.blob(prepared.scene))))
     fitted = FitMetrics(log_mse=0.1, log_mse_zero=1.0, log_mse_rel=0.1, texels=144, signal=True)
     manifest = Manifest(

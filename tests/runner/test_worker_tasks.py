@@ -216,3 +216,22 @@ def test_what_a_worker_logs_bears_the_ids_of_job_and_task(coordinator, worker: W
         found = (line["job_id"], line["task_id"], line["worker_id"], line["kind"], line["attempt"])
         assert found == ("job", task, "w1", "fit", 3)
     assert done["seconds"] > 0 and done["level"] == "info"
+
+
+def test_a_blob_that_never_arrives_whole_fails_the_attempt_by_its_name(coordinator, worker: Worker) -> None:
+    """One wrong byte each time: the child gives up after some tries, so the heartbeats do not go on for ever."""
+    sha256 = coordinator.put(b"the scene")
+    coordinator.blobs[sha256] = b"the scenf"
+    coordinator.add(f"blob:{sha256}")
+    worker.step()
+    (failure,) = coordinator.named("/fail")
+    assert failure["problem"]["code"] == "damaged" and failure["retryable"]
+    assert sha256 in failure["problem"]["where"] and "10 tries" in failure["problem"]["detail"]
+    asked = [path for path, _ in coordinator.calls if path.endswith(sha256)]
+    assert len(asked) == 10
+
+
+def test_a_checkpoint_that_is_lost_is_none(coordinator, worker: Worker) -> None:
+    coordinator.add("resume", checkpoint="ab" * 32)
+    worker.step()
+    assert len(coordinator.named("/commit")) == 1 and weights(coordinator) == b""

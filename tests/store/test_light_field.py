@@ -2,18 +2,21 @@
 
 import json
 import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import zarr
 
-from kiln_schemas.errors import Conflict, InputError, InternalError, MachineLacks, NotFound
+from kiln_schemas.errors import Conflict, InputError, InternalError, MachineLacks, NotFound, StoreLost, TilesLost
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.store import location
@@ -66,8 +69,8 @@ def test_reads_back_what_was_written(url: str) -> None:
     for seed, function in enumerate(Function):
         np.testing.assert_array_equal(store.read_tile(function, PLACE, COVERED), images(4, seed))
         np.testing.assert_array_equal(store.read_tile(function, PLACE, COVERED[[2, 0]]), images(4, seed)[[2, 0]])
-    assert store.read_irradiance()[8 + 2, 16 + 1].tolist() == [6.0, 7.0, 8.0]  # 17 = row 2, column 1
-    assert store.read_irradiance().sum() == np.arange(12).sum()
+    assert store.read_irradiance([PLACE])[8 + 2, 16 + 1].tolist() == [6.0, 7.0, 8.0]  # 17 = row 2, column 1
+    assert store.read_irradiance([PLACE]).sum() == np.arange(12).sum()
 
 
 def test_stock_zarr_python_reads_the_same_and_sees_absent_chunks(url: str) -> None:
@@ -135,24 +138,122 @@ def test_a_rewritten_tile_is_the_same_bytes(url: str, tmp_path: Path) -> None:
 
 
 def test_missing_tile_store_and_function_are_errors(url: str) -> None:
-    with pytest.raises(NotFound, match="no light-field store"):
+    with pytest.raises(StoreLost, match="not there"):
         LightFieldStore.open(url)
     store = make(url, functions=(Function.LIGHT_FIELD,))
-    with pytest.raises(NotFound, match="row 8, column 16"):
+    with pytest.raises(TilesLost, match="tile 8,16 are gone"):
         store.read_tile(Function.LIGHT_FIELD, PLACE, COVERED)
     with pytest.raises(NotFound, match="no visibility"):
         store.read_tile(Function.VISIBILITY, PLACE, COVERED)
 
 
-def test_damage_is_found_by_the_checksum(url: str) -> None:
+SHARDS = {
+    "light_field": "light_field/c/1/2/0/0/0",
+    "visibility": "visibility/c/1/2/0/0/0",
+    "between": "between/c/1/2/0/0/0/0",
+    "irradiance": "irradiance/c/1/2/0",
+}
+
+
+def read(store: LightFieldStore, array: str) -> npt.NDArray[Any]:
+    """What a tile has in one of the arrays."""
+    if array == "irradiance":
+        return store.read_irradiance([PLACE])
+    return (
+        store.read_between(PLACE, COVERED) if array == "between" else store.read_tile(Function(array), PLACE, COVERED)
+    )
+
+
+@pytest.mark.parametrize("array", SHARDS)
+def test_one_wrong_byte_anywhere_is_found_and_so_is_a_cut_or_lost_object(url: str, array: str) -> None:
+    store = make(url, between=True)
+    fill(store)
+    store.write_between(PLACE, COVERED, np.ones((4, 3, R // 2, R // 2, 3), np.float16))
+    good = read(store, array)
+    shard = folder(url) / SHARDS[array]
+    data = shard.read_bytes()
+    stored = [range(len(data))] if array == "irradiance" else [range(40), range(len(data) // 2, len(data), 7)]
+    for place in chain(*stored):
+        shard.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        with pytest.raises(TilesLost, match=f"{array} of tile 8,16") as caught:
+            read(LightFieldStore.open(url), array)
+        assert caught.value.labels == ("tile 8,16",) and caught.value.where == url
+    for length in (0, 3, len(data) // 2, len(data) - 1):
+        shard.write_bytes(data[:length])
+        with pytest.raises(TilesLost, match="damaged"):
+            read(LightFieldStore.open(url), array)
+    shard.unlink()
+    with pytest.raises(TilesLost, match=f"{array} of tile 8,16 are gone"):
+        read(LightFieldStore.open(url), array)
+    shard.write_bytes(data)
+    np.testing.assert_array_equal(read(LightFieldStore.open(url), array), good)
+
+
+@pytest.mark.parametrize("array", SHARDS)
+def test_a_damaged_tile_is_replaced_when_it_is_written_again(url: str, array: str) -> None:
+    store = make(url, between=True)
+    between = np.ones((4, 3, R // 2, R // 2, 3), np.float16)
+    fill(store)
+    store.write_between(PLACE, COVERED, between)
+    before = objects(url)
+    data = before[SHARDS[array]]
+    for bad in (data[:100] + b"x" + data[101:], data[:-2] + b"x" + data[-1:], data[: len(data) // 2], b""):
+        (folder(url) / SHARDS[array]).write_bytes(bad)
+        again = LightFieldStore.open(url)
+        fill(again)
+        again.write_between(PLACE, COVERED, between)
+        assert objects(url) == before
+
+
+def test_black_texels_are_stored_and_single_ones_that_are_not_are_an_error(url: str) -> None:
+    store = make(url, functions=(Function.LIGHT_FIELD,))
+    black = images(4)
+    black[1] = 0.0
+    store.write_tile(PLACE, COVERED, black, None, np.zeros((4, 3), np.float32))
+    np.testing.assert_array_equal(store.read_tile(Function.LIGHT_FIELD, PLACE, COVERED), black)
+    assert not store.read_irradiance([PLACE]).any()
+    with pytest.raises(TilesLost, match="are gone"):
+        store.read_tile(Function.LIGHT_FIELD, PLACE, np.array([*COVERED, 5]))
+
+
+def test_all_lost_tiles_are_named_at_once(url: str) -> None:
     store = make(url)
     fill(store)
-    shard = folder(url) / "light_field" / "c" / "1" / "2" / "0" / "0" / "0"
-    data = bytearray(shard.read_bytes())
-    data[100] ^= 1
-    shard.write_bytes(data)
-    with pytest.raises(MachineLacks, match="damaged"):
-        LightFieldStore.open(url).read_tile(Function.LIGHT_FIELD, PLACE, COVERED)
+    other, third = (Tile(row=0, column=column, size=TILE, texels=4) for column in (0, 8))
+    tiles = {PLACE: COVERED, other: COVERED, third: COVERED}
+    with pytest.raises(TilesLost) as caught, store.all_lost(["light_field"], tiles):
+        store.read_tile(Function.LIGHT_FIELD, other, COVERED)
+    assert caught.value.labels == ("tile 0,0", "tile 0,8")
+    with pytest.raises(TilesLost) as caught:
+        store.read_irradiance(tiles)
+    assert caught.value.labels == ("tile 0,0", "tile 0,8")
+
+
+@pytest.mark.parametrize("damage", [None, b"{", b'{"zarr_format": 3}'])
+@pytest.mark.parametrize("name", ["zarr.json", "visibility/zarr.json"])
+def test_a_store_whose_documents_are_damaged_is_made_anew_by_create(url: str, name: str, damage: bytes | None) -> None:
+    fill(make(url))
+    before = objects(url)
+    document = folder(url) / name
+    document.unlink() if damage is None else document.write_bytes(damage)
+    with pytest.raises(StoreLost):
+        LightFieldStore.open(url).read_tile(Function.VISIBILITY, PLACE, COVERED)
+    fill(make(url))
+    assert objects(url) == before
+
+
+def test_a_store_that_was_deleted_takes_no_more_tiles(url: str) -> None:
+    store = make(url)
+    store.check()
+    shutil.rmtree(folder(url))
+    with pytest.raises(StoreLost, match="not there any more"):
+        store.check()
+
+
+def test_a_texel_map_with_a_lost_part_is_an_error(url: str) -> None:
+    store = make(url)
+    with pytest.raises(StoreLost, match="are gone"):
+        store.read_texel_map()
 
 
 def test_values_that_are_not_finite_are_refused(url: str) -> None:
@@ -226,13 +327,13 @@ def test_a_real_s3_server(s3_server: Any, monkeypatch: pytest.MonkeyPatch) -> No
     for name, value in s3_server.environment().items():
         monkeypatch.setenv(name, value)
     url = f"s3://{s3_server.bucket}/bakes/one"
-    with pytest.raises(NotFound, match="no light-field store"):
+    with pytest.raises(StoreLost, match="not there"):
         LightFieldStore.open(url)
     fill(make(url))
     fill(make(url))
     store = LightFieldStore.open(url)
     np.testing.assert_array_equal(store.read_tile(Function.VISIBILITY, PLACE, COVERED), images(4, 1))
-    with pytest.raises(NotFound, match="row 0, column 0"):
+    with pytest.raises(TilesLost, match="tile 0,0 are gone"):
         store.read_tile(Function.VISIBILITY, Tile(row=0, column=0, size=TILE, texels=4), COVERED)
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
     with pytest.raises(MachineLacks, match="refuses access"):

@@ -1,6 +1,6 @@
 """Routes of blobs: ask which are missing, upload, download."""
 
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Depends, Request, Response
 
@@ -9,15 +9,16 @@ from kiln_schemas.job import MissingReply, MissingRequest
 from kiln_schemas.operators import Scope
 from kiln_service.api.common import PartsHere, Sha256Path, any_caller, problems
 from kiln_service.api.files import serve_blob
+from kiln_service.auth import Principal
 
 router = APIRouter(prefix="/v1/blobs", tags=["blobs"])
 
-Uploader = Depends(any_caller(Scope.SUBMIT, Scope.WORKER, Scope.ADMIN))
+Uploader = Annotated[Principal, Depends(any_caller(Scope.SUBMIT, Scope.WORKER, Scope.ADMIN))]
 Downloader = Depends(any_caller(Scope.READ, Scope.WORKER, Scope.ADMIN))
 
 
-@router.post("/missing", dependencies=[Uploader], responses=problems(422))
-async def missing(request: MissingRequest, parts: PartsHere) -> MissingReply:
+@router.post("/missing", responses=problems(422))
+async def missing(request: MissingRequest, parts: PartsHere, _: Uploader) -> MissingReply:
     """Which of these blobs have to be uploaded; the others are kept for an hour at least."""
     return MissingReply(missing=tuple(await parts.blobs.missing(request.sha256)))
 
@@ -26,16 +27,15 @@ async def missing(request: MissingRequest, parts: PartsHere) -> MissingReply:
     "/{sha256}",
     status_code=201,
     response_class=Response,
-    dependencies=[Uploader],
-    responses=problems(400, 413, 422, 507) | {201: {"description": "Stored, or here already"}},
+    responses=problems(400, 413, 422, 507) | {201: {"description": "Stored, in place of what was here"}},
     openapi_extra={"requestBody": {"required": True, "content": {"application/octet-stream": {}}}},
 )
-async def upload(sha256: Sha256Path, request: Request, parts: PartsHere) -> Response:
+async def upload(sha256: Sha256Path, request: Request, parts: PartsHere, who: Uploader) -> Response:
     """Upload bytes; they are stored if, and only if, they are whole and have this hash."""
     announced = request.headers.get("content-length")
     if announced is not None and not announced.isdigit():
         raise InputError(f"'{announced}' is not a length", where="Content-Length")
-    await parts.blobs.receive(sha256, request.stream(), int(announced) if announced else None)
+    await parts.blobs.receive(sha256, request.stream(), int(announced) if announced else None, who.name)
     return Response(status_code=201, headers={"ETag": f'"{sha256}"'})
 
 

@@ -36,7 +36,7 @@ Submitter = Annotated[Principal, Depends(caller(Scope.SUBMIT))]
 UNSEEN: Final[dict[int | str, dict[str, Any]]] = {204: {"description": "Done; the token may not look at jobs"}}
 
 
-@router.post("/jobs", status_code=201, responses=problems(409, 413, 422))
+@router.post("/jobs", status_code=201, responses=problems(409, 413, 422, 507))
 async def submit(
     request: JobRequest,
     parts: PartsHere,
@@ -115,14 +115,14 @@ async def resume(job_id: str, parts: PartsHere, who: Submitter) -> JobView | Res
 @router.post("/jobs/{job_id}/retry", response_model=JobView, responses=problems(404, 409) | UNSEEN)
 async def retry(job_id: str, parts: PartsHere, who: Submitter) -> JobView | Response:
     """Do a failed or canceled job's unfinished tasks again, or a live one's failed tasks; what has completed stays."""
-    await jobs.retry(parts.database, job_id, who.actor)
+    await jobs.retry(parts.database, parts.config, job_id, who.actor)
     return await _seen(parts, job_id, who)
 
 
 @router.post("/jobs/{job_id}/requeue", response_model=JobView, responses=problems(404, 409, 422) | UNSEEN)
 async def requeue(job_id: str, wanted: RequeueRequest, parts: PartsHere, who: Submitter) -> JobView | Response:
     """Do tasks again though they are done, and all that follows from them; a completed job's artifacts go meanwhile."""
-    await jobs.requeue(parts.database, job_id, wanted, who.actor)
+    await jobs.requeue(parts.database, parts.config, job_id, wanted, who.actor)
     return await _seen(parts, job_id, who)
 
 

@@ -35,7 +35,6 @@ _DO: Final[Mapping[Action, Callable[[Database, str, str], Awaitable[None]]]] = {
     "pause": jobs.pause,
     "resume": jobs.resume,
     "cancel": jobs.cancel,
-    "retry": jobs.retry,
     "archive": jobs.archive,
 }
 _ACTIONS: Final[Mapping[Action, tuple[Set[JobState], str, str]]] = {
@@ -94,7 +93,10 @@ async def rank(job_id: str, parts: PartsHere, who: Submitter, form: Form) -> Res
 @router.post("/jobs/{job_id}/do/{action}")
 async def act(job_id: str, action: Action, parts: PartsHere, who: Submitter, _: Form) -> Response:
     """Pause, resume, cancel, retry or archive the job."""
-    await _DO[action](parts.database, job_id, who.actor)
+    if action == "retry":
+        await jobs.retry(parts.database, parts.config, job_id, who.actor)
+    else:
+        await _DO[action](parts.database, job_id, who.actor)
     return see(f"/jobs/{job_id}")
 
 
@@ -113,7 +115,7 @@ async def task(request: Request, task_id: str, parts: PartsHere) -> Response:
         over=view.state in OVER_TASK_STATES,
         may_redo=view.state in OVER_TASK_STATES
         and view.kind is not TaskKind.PREPARE
-        and JobState(row["job_state"]) in LIVE_JOB_STATES | PUBLISHED_JOB_STATES,
+        and JobState(row["job_state"]) in LIVE_JOB_STATES | PUBLISHED_JOB_STATES | {JobState.FAILED},
     )
 
 
@@ -124,7 +126,7 @@ async def redo(task_id: str, parts: PartsHere, who: Submitter, _: Form) -> Respo
     if row["kind"] == TaskKind.PREPARE:
         raise Conflict("a scene is prepared once", where=row["label"], remedy="Submit the job again.")
     wanted = RequeueRequest(kind=row["kind"], labels=(row["label"],))
-    await jobs.requeue(parts.database, row["job_id"], wanted, who.actor)
+    await jobs.requeue(parts.database, parts.config, row["job_id"], wanted, who.actor)
     return see(f"/tasks/{task_id}")
 
 

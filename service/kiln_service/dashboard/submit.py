@@ -32,9 +32,9 @@ async def submit_form(request: Request, _: Submitter) -> Response:
 
 
 @router.put(UPLOAD_PATH, dependencies=[Checked])
-async def upload(request: Request, parts: PartsHere, _: Submitter) -> Response:
+async def upload(request: Request, parts: PartsHere, who: Submitter) -> Response:
     """Take a file; the answer tells its hash."""
-    return JSONResponse({"sha256": await parts.blobs.take(request.stream())}, 201)
+    return JSONResponse({"sha256": await parts.blobs.take(request.stream(), who.name)}, 201)
 
 
 @router.post("/submit", dependencies=[Checked])

@@ -88,6 +88,12 @@ SET state = %(after)s, result = NULL,
 WHERE job_id = %(job_id)s AND id = ANY(%(ids)s) AND state = ANY(%(before)s)
 RETURNING id;
 
+-- name: hold_tasks
+-- queued, soft-failed, active > waiting: tasks of some kinds of a job, which keep their checkpoints.
+UPDATE tasks
+SET state = 'waiting', progress = NULL, worker_id = NULL, started = NULL, heartbeat = NULL
+WHERE job_id = %(job_id)s AND kind = ANY(%(kinds)s) AND state = ANY(%(before)s);
+
 -- name: forgive_tasks
 -- failed, soft-failed > queued where nobody else failed them often enough: a worker's failures count no more.
 WITH forgiven AS (

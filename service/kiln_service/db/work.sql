@@ -12,6 +12,15 @@ SELECT * FROM tasks WHERE id = %(id)s FOR UPDATE;
 -- Which job to lock before a task.
 SELECT job_id FROM tasks WHERE id = %(id)s;
 
+-- name: job_of_prepare
+-- The job of a prepare task that was not prepared before.
+SELECT jobs.* FROM jobs JOIN tasks ON tasks.job_id = jobs.id
+WHERE tasks.id = %(id)s AND tasks.kind = 'prepare' AND jobs.prepared IS NULL;
+
+-- name: store_of_task
+-- Where the light fields of a task's job are, and how often the task has failed.
+SELECT jobs.store_url, tasks.strikes FROM jobs JOIN tasks ON tasks.job_id = jobs.id WHERE tasks.id = %(id)s;
+
 -- name: stage_left
 -- Whether tasks of a kind have not completed; and where nothing of the job can be worked on any more because tasks
 -- failed, the error of the first that did.
@@ -253,12 +262,25 @@ SELECT * FROM jobs WHERE submitter = %(submitter)s AND idempotency_key = %(key)s
 -- What the light fields of a prepared job depend on.
 UPDATE jobs SET render_key = %(key)s WHERE id = %(id)s;
 
--- name: find_renders
--- The newest other job whose light fields are the same and all there, and that has what the descent learns from; it is
--- not archived before this transaction ends.
+-- name: find_sources
+-- Other jobs whose light fields are the same and all there, newest first, as far as the database knows.
 SELECT jobs.id, jobs.store_url FROM jobs
 JOIN tasks AS prepared ON prepared.job_id = jobs.id AND prepared.kind = 'prepare' AND prepared.state = 'completed'
 WHERE jobs.render_key = %(key)s AND jobs.id <> %(id)s AND jobs.method = %(method)s AND jobs.state <> 'archived'
+  AND (%(between)s::jsonb = '[]' OR COALESCE(prepared.result -> 'between', '[]') = %(between)s)
+  AND NOT EXISTS (
+      SELECT FROM tasks WHERE tasks.job_id = jobs.id AND tasks.kind = 'render' AND tasks.state <> 'completed'
+  )
+ORDER BY jobs.id DESC
+LIMIT 100;
+
+-- name: find_renders
+-- The newest of some jobs whose light fields are the same and all there, and that has what the descent learns from; it
+-- is not archived before this transaction ends.
+SELECT jobs.id, jobs.store_url FROM jobs
+JOIN tasks AS prepared ON prepared.job_id = jobs.id AND prepared.kind = 'prepare' AND prepared.state = 'completed'
+WHERE jobs.render_key = %(key)s AND jobs.id <> %(id)s AND jobs.method = %(method)s AND jobs.state <> 'archived'
+  AND jobs.id = ANY(%(sources)s::text[])
   AND (%(between)s::jsonb = '[]' OR COALESCE(prepared.result -> 'between', '[]') = %(between)s)
   AND NOT EXISTS (
       SELECT FROM tasks WHERE tasks.job_id = jobs.id AND tasks.kind = 'render' AND tasks.state <> 'completed'

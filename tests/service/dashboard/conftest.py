@@ -122,6 +122,11 @@ class KnownBake:
         irradiance = np.tile(np.float32([3.0, 1.0, 0.2]), (len(inside), 1))
         self.store.write_tile(place, inside, images, None, irradiance)
 
+    def irradiance(self, row: int, column: int) -> np.ndarray:
+        """[8, 8, 3] of a tile, as it is stored."""
+        tile = Tile(row=row, column=column, size=8, texels=1)
+        return self.store.read_irradiance([tile])[row : row + 8, column : column + 8]
+
     @property
     def state(self) -> np.ndarray:
         """[32, 32]: the first eight rows but for a gutter every eighth column."""

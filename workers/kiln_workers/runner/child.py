@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from kiln_schemas.base import Contract
-from kiln_schemas.errors import DISK_FULL, InternalError, KilnError, MachineLacks
+from kiln_schemas.errors import DISK_FULL, InternalError, KilnError, MachineLacks, TilesLost
 from kiln_schemas.redact import redacted
-from kiln_schemas.tasks import Claim, Progress, Result, TaskKind
+from kiln_schemas.tasks import LOST_AT_ONCE, Claim, Progress, Result, TaskKind
 from kiln_workers.runner.blobs import BlobCache
 from kiln_workers.runner.client import CoordinatorClient
 from kiln_workers.runner.context import TaskContext
@@ -73,6 +73,8 @@ class Child:
             scratch.mkdir(parents=True)
             tempfile.tempdir = str(scratch)  # what libraries write beside goes with it
             return Done(result=self._call_stage(claim, scratch))
+        except TilesLost as error:
+            return Failed(problem=error.problem(), retryable=error.retryable, lost=error.labels[:LOST_AT_ONCE])
         except KilnError as error:
             return Failed(problem=error.problem(), retryable=error.retryable)
         except Exception as error:

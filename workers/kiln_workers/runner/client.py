@@ -19,7 +19,16 @@ from typing import Final, Self
 import httpx
 
 from kiln_schemas.base import Contract
-from kiln_schemas.errors import TooMany, Unreachable, error_of_answer, wait_asked
+from kiln_schemas.errors import (
+    Damaged,
+    InputError,
+    KilnError,
+    TooMany,
+    Truncated,
+    Unreachable,
+    error_of_answer,
+    wait_asked,
+)
 from kiln_schemas.job import MissingReply
 from kiln_schemas.proxies import is_loopback
 from kiln_schemas.tasks import (
@@ -39,8 +48,12 @@ PAUSE_S: Final = (0.1, 5.0)
 """First and longest pause between two tries."""
 DEFECT_PATIENCE_S: Final = 60.0
 """A coordinator that answers 500 is asked again for so long: it may be losing its database for a moment."""
+TRANSFERS: Final = 10
+"""A blob whose bytes do not arrive whole and right so many times is given up: it would be transferred for ever."""
 AWAY: Final = frozenset({TooMany.status, 502, 503, 504})
 """Statuses of a coordinator, or of a proxy before it, that will be back."""
+WRONG_BYTES: Final = frozenset({InputError.status, Truncated.status})
+"""Statuses of an upload whose bytes are not those that were sent: the hash was taken of what was read here."""
 
 
 class CoordinatorClient:
@@ -112,20 +125,32 @@ class CoordinatorClient:
         self._post(f"/v1/tasks/{task_id}/checkpoint", checkpoint)
 
     def fetch_blob(self, sha256: str, target: Path) -> None:
-        """Download a blob to `target`, whole and with the right hash or not at all."""
+        """Download a blob to `target`, whole and with the right hash or not at all.
+
+        Damaged where the coordinator has lost its bytes, or they were cut off or wrong `TRANSFERS` times.
+        """
         partial = target.with_name(target.name + ".partial")
+        partial.unlink(missing_ok=True)  # it may be a link
+        broken = 0
 
         def attempt() -> httpx.Response:
+            nonlocal broken
             digest = hashlib.sha256()
             with self._http.stream("GET", f"/v1/blobs/{sha256}") as response, partial.open("wb") as file:
                 if not response.is_success:
                     response.read()
                     return response
-                for chunk in response.iter_bytes(CHUNK):
-                    digest.update(chunk)
-                    file.write(chunk)
-            if digest.hexdigest() != sha256:
-                raise httpx.ReadError(f"blob {sha256} arrived damaged")
+                try:
+                    for chunk in response.iter_bytes(CHUNK):
+                        digest.update(chunk)
+                        file.write(chunk)
+                    if digest.hexdigest() != sha256:
+                        raise httpx.ReadError("its bytes have another hash")
+                except httpx.TransportError as error:
+                    broken += 1
+                    if broken == TRANSFERS:
+                        raise _never_whole(sha256, f"down, last because {error}") from None
+                    raise
             return response
 
         try:
@@ -137,14 +162,22 @@ class CoordinatorClient:
     def put_blob(self, sha256: str, source: bytes | Path) -> None:
         """Upload a blob, unless the coordinator has it already."""
         size = len(source) if isinstance(source, bytes) else source.stat().st_size
+        broken = 0
 
         def attempt() -> httpx.Response:
+            nonlocal broken
             # Asking also keeps the blob from being collected as garbage before the commit names it.
             known = self._http.post("/v1/blobs/missing", json={"sha256": [sha256]})
             if not known.is_success or not MissingReply.model_validate_json(known.content).missing:
                 return known
             headers = {"Content-Length": str(size), "Content-Type": "application/octet-stream"}
-            return self._http.put(f"/v1/blobs/{sha256}", content=_chunks(source), headers=headers, timeout=300)
+            reply = self._http.put(f"/v1/blobs/{sha256}", content=_chunks(source), headers=headers, timeout=300)
+            if reply.status_code in WRONG_BYTES:
+                broken += 1
+                if broken == TRANSFERS:
+                    raise _never_whole(sha256, f"up, last because {self._error(reply)}")
+                raise httpx.WriteError(f"blob {sha256} arrived damaged")
+            return reply
 
         self._patiently(attempt)
 
@@ -176,8 +209,7 @@ class CoordinatorClient:
                 if response.is_success:
                     return response
                 if response.status_code not in AWAY and response.status_code != httpx.codes.INTERNAL_SERVER_ERROR:
-                    asked = f"{response.request.method} {response.request.url.path}"
-                    raise error_of_answer(response.content, response.status_code, asked, self.url)
+                    raise self._error(response)
                 reason = f"it answers {response.status_code}"
                 bound = patience if response.status_code in AWAY else min(patience, DEFECT_PATIENCE_S)
                 asked_s = wait_asked(response.headers.get("retry-after"))
@@ -192,6 +224,18 @@ class CoordinatorClient:
             # Up to a half of random extra keeps a farm from returning in step.
             self._stop.wait(max(pause, asked_s) * random.uniform(1.0, 1.5))
             pause = min(2 * pause, PAUSE_S[1])
+
+    def _error(self, response: httpx.Response) -> KilnError:
+        asked = f"{response.request.method} {response.request.url.path}"
+        return error_of_answer(response.content, response.status_code, asked, self.url)
+
+
+def _never_whole(sha256: str, how: str) -> Damaged:
+    return Damaged(
+        f"the blob's bytes did not arrive whole and right in {TRANSFERS} tries on their way {how}",
+        where=f"blob {sha256}",
+        remedy="Check the network between worker and coordinator, and the memory of both.",
+    )
 
 
 def _chunks(source: bytes | Path) -> Iterator[bytes]:

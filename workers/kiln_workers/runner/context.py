@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from kiln_schemas.errors import Canceled
+from kiln_schemas.errors import Canceled, NotFound
 from kiln_schemas.tasks import Checkpoint, Claim, Progress
 from kiln_workers.runner.blobs import BlobCache, file_sha256
 from kiln_workers.runner.client import CoordinatorClient
@@ -49,7 +49,7 @@ class Context(Protocol):
         """Publish a state from which another attempt can go on."""
 
     def last_checkpoint(self) -> bytes | None:
-        """The state that the last attempt published, if any."""
+        """The state that the last attempt published, if there is one and its bytes are not lost."""
 
     def log(self, text: str) -> None:
         """A line for the task's log."""
@@ -102,7 +102,13 @@ class TaskContext:
         )
 
     def last_checkpoint(self) -> bytes | None:
-        return None if self._claim.checkpoint is None else self.blob(self._claim.checkpoint)
+        if self._claim.checkpoint is None:
+            return None
+        try:
+            return self.blob(self._claim.checkpoint)
+        except NotFound as error:
+            self.log(f"the checkpoint is lost, so the task begins again: {error}")
+            return None
 
     def log(self, text: str) -> None:
         print(text, file=sys.stderr, flush=True)

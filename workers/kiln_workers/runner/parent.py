@@ -248,7 +248,7 @@ class Worker:
             case Done(result=result):
                 self._commit(claim, result)
             case Failed(problem=problem, retryable=retryable) if problem.code != StaleAttempt.code:
-                self._fail(claim, KilnError.from_problem(problem), retryable)
+                self._fail(claim, KilnError.from_problem(problem), retryable, outcome.lost)
             case Ended():
                 self._fail(claim, self._death(outcome), True)
             case _:
@@ -268,10 +268,10 @@ class Worker:
             self._announce("task.completed", _names(claim) | {"seconds": result.seconds})
             self._failures = 0
 
-    def _fail(self, claim: Claim, error: KilnError, retryable: bool) -> None:
+    def _fail(self, claim: Claim, error: KilnError, retryable: bool, lost: tuple[str, ...] = ()) -> None:
         self._announce("task.failed", _names(claim) | {"problem": str(error), "retryable": retryable})
         with suppress(StaleAttempt, NotFound):
-            self._client.fail(claim.task_id, self._failure(claim, error, retryable))
+            self._client.fail(claim.task_id, self._failure(claim, error, retryable, lost))
         # It is settled: what follows is a pause, in which nothing has to be given back.
         self._current = None
         if retryable:
@@ -279,7 +279,7 @@ class Worker:
             self._failures += 1
             time.sleep(min(PAUSE_MAX_S, 0.25 * 2**self._failures))
 
-    def _failure(self, claim: Claim, error: KilnError, retryable: bool) -> Failure:
+    def _failure(self, claim: Claim, error: KilnError, retryable: bool, lost: tuple[str, ...] = ()) -> Failure:
         tail = "\n".join(self._child.tail) if self._child else ""
         return Failure(
             attempt=claim.attempt,
@@ -287,6 +287,7 @@ class Worker:
             problem=error.problem(),
             retryable=retryable,
             log=tail[-LOG_CHARACTERS:],
+            lost=lost,
         )
 
     def _death(self, ended: Ended) -> KilnError:

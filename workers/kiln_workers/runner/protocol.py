@@ -12,7 +12,7 @@ from pydantic import Field, TypeAdapter
 
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import Problem
-from kiln_schemas.tasks import Claim, Progress, Result, TaskKind
+from kiln_schemas.tasks import Claim, Labels, Progress, Result, TaskKind
 
 END_OF_LOG: Final = "\x1e end of the task's log"
 """The child's last line on standard error of every task."""
@@ -78,6 +78,8 @@ class Failed(Contract):
     say: Literal["failed"] = "failed"
     problem: Problem
     retryable: bool
+    lost: Labels = ()
+    """Labels of the render tasks whose tiles are lost."""
 
 
 ToChild: Final[TypeAdapter[Setup | Work | Stop]] = TypeAdapter(

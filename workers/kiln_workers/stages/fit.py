@@ -1,7 +1,7 @@
 """Fit one function: stream the rendered tiles through the network until it is trained."""
 
 from kiln_schemas.tasks import FitPayload, FitResult, Progress
-from kiln_workers.fit.source import StoreSource
+from kiln_workers.fit.source import StoreSource, valid_texels
 from kiln_workers.fit.train import train
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.texel_map import unpack_texel_map
@@ -24,17 +24,19 @@ def run(payload: FitPayload, context: Context) -> FitResult:
 
     asked = payload.settings.fit
     settings = asked.model_copy(update={"steps": getattr(asked, asked.steps_key(payload.function))})
-    outcome = train(
-        source,
-        settings,
-        payload.function,
-        payload.settings.seed,
-        threads=context.threads,
-        checkpoint=checkpoint,
-        on_checkpoint=context.checkpoint,
-        on_progress=on_progress,
-        checkpoint_every_s=settings.checkpoint_s,
-    )
+    covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles}
+    with store.all_lost([payload.function.value], covered):
+        outcome = train(
+            source,
+            settings,
+            payload.function,
+            payload.settings.seed,
+            threads=context.threads,
+            checkpoint=checkpoint,
+            on_checkpoint=context.checkpoint,
+            on_progress=on_progress,
+            checkpoint_every_s=settings.checkpoint_s,
+        )
     context.log(f"{payload.function.value}: log_mse_rel {outcome.metrics.log_mse_rel:.4f}")
     return FitResult(
         function=payload.function,

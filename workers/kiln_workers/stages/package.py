@@ -62,13 +62,17 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
     tiles = tuple(sorted((render.tile for render in payload.renders), key=lambda tile: (tile.row, tile.column)))
 
     steps = len(payload.fits) + 2
+    irradiance = store.read_irradiance(tiles)
+    covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles}
     lobes: dict[Function, LobeMap] = {}
     metrics: dict[Function, FitMetrics] = {}
     previews: dict[Function, FunctionPreview] = {}
     for number, fit in enumerate(payload.fits):
         context.progress(number, steps, "steps", f"evaluating the {fit.function.value}")
         texels = _Texels(store, texel_map, tiles, fit.function)
-        judged = _judge(fit, payload.refines if fit.function is Function.LIGHT_FIELD else (), texels, context)
+        refines = payload.refines if fit.function is Function.LIGHT_FIELD else ()
+        with store.all_lost([fit.function.value], covered):
+            judged = _judge(fit, refines, texels, context)
         lobes[fit.function], metrics[fit.function], previews[fit.function] = judged
 
     context.progress(steps - 2, steps, "steps", "convolving the environment")
@@ -84,7 +88,7 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
             payload=payload,
             scene=scene,
             texel_map=texel_map,
-            irradiance=store.read_irradiance(),
+            irradiance=irradiance,
             lobes=lobes,
             metrics=metrics,
             preview=PackagePreview(atlas=texel_map_picture(texel_map), functions=previews),

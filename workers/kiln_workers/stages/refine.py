@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from kiln_schemas.conventions import FP16_MAX, REFINE_HALO
+from kiln_schemas.conventions import ARRAY_BETWEEN, ARRAY_LIGHT_FIELD, FP16_MAX, REFINE_HALO
 from kiln_schemas.tasks import Block, RefinePayload, RefineResult, Tile
 from kiln_workers.fit.between import read_field
 from kiln_workers.fit.field import TexelField
@@ -40,7 +40,9 @@ def run(payload: RefinePayload, context: Context) -> RefineResult:
     weights = Weights.from_bytes(context.blob(payload.fit.weights))
     store = LightFieldStore.open(payload.store_url)
     tiles = list(_wanted(texel_map, sorted((r.tile for r in payload.renders), key=lambda t: (t.row, t.column)), block))
-    field = read_field(store, texel_map, tiles, weights.exposure, lambda: _moved(payload, context))
+    arrays = [ARRAY_LIGHT_FIELD, ARRAY_BETWEEN] if store.has_between else [ARRAY_LIGHT_FIELD]
+    with store.all_lost(arrays, dict(tiles)):
+        field = read_field(store, texel_map, tiles, weights.exposure, lambda: _moved(payload, context))
     start = predict(weights, field.images, field.normals, threads=context.threads)
     found = start
     if weights.signal and len(field):

@@ -31,6 +31,7 @@ def run(payload: RenderPayload, context: Context) -> RenderResult:
     """Path-trace a tile and replace its shard; the same payload always gives the same bytes."""
     began = time.perf_counter()
     warm = _warm(payload, context)
+    warm.store.check()
     texel_map, tile = warm.texel_map, payload.tile
     inside = covered_texels(texel_map, tile)
     place = map_coordinates(tile, inside)
@@ -47,6 +48,7 @@ def run(payload: RenderPayload, context: Context) -> RenderResult:
         between, more = _trace_between(warm, payload, place, lambda done: on_progress(share + (1.0 - share) * done))
         warm.store.write_between(tile, inside, between)
         paths += more
+    warm.store.check()
     invalid = inside[images.back_faces > BACK_FACE_LIMIT]
     return RenderResult(
         tile=tile,

@@ -2,12 +2,14 @@
 
 Written by render workers tile by tile, streamed by the fit, and readable with stock zarr-python. tensorstore does the
 work because its writers replace a shard atomically (lock file, fsync, rename; one PUT on S3): a killed writer leaves
-the old shard or none, never a torn one. An absent shard reads as zeros in silence, hence `read_tile` first asks
-whether the shard's key exists. Completeness of a bake is the database's business, not the store's.
+the old shard or none, never a torn one. Every chunk and every shard's index has a CRC-32C, so damaged bytes are an
+error when they are read. What is absent reads as zeros in silence, so every reader asks of zeros if they are stored.
+Which tiles a bake must have is the database's business, not the store's.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, Final, Self
 
 import numpy as np
@@ -15,11 +17,19 @@ import numpy.typing as npt
 import tensorstore as ts
 
 from kiln_schemas import conventions
-from kiln_schemas.errors import Conflict, InputError, InternalError, NotFound
+from kiln_schemas.errors import Conflict, InputError, InternalError, NotFound, StoreLost, TilesLost
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.store import layout
-from kiln_workers.store.location import kvstore_spec, translated_errors, write_patiently
+from kiln_workers.store.location import (
+    first_words,
+    is_damage,
+    is_difference,
+    kvstore_spec,
+    translated,
+    translated_errors,
+    write_patiently,
+)
 
 Float16 = npt.NDArray[np.float16]
 Float32 = npt.NDArray[np.float32]
@@ -56,16 +66,24 @@ class LightFieldStore:
     ) -> Self:
         """Make the store, or open it where an identical one lies there; Conflict where a different one does.
 
+        What is damaged of an identical one is made anew.
+
         `attributes` (settings, scene hash, ...) must be JSON. The group document is written last, so a
         store that opens is whole.
         """
         mine = json.loads(json.dumps(layout.group_attributes(shape, image_size, tile, functions, between, attributes)))
-        found = _read_group(url)
+        try:
+            found = _read_group(url)
+        except StoreLost:
+            found = None
         if found is not None:
             _refuse_difference(url, found, mine)
         store = cls(url, mine)
         for name in store._metadata():
-            store._arrays[name] = store._open_array(name, create=True)
+            try:
+                store._arrays[name] = store._open_array(name, create=True)
+            except StoreLost:
+                store._arrays[name] = store._open_array(name, create=True, delete_existing=True)
         if found is None:
             with translated_errors(url):
                 document = json.dumps(layout.group_document(mine), indent=1, sort_keys=True)
@@ -74,10 +92,10 @@ class LightFieldStore:
 
     @classmethod
     def open(cls, url: str) -> Self:
-        """Open an existing store; NotFound where there is none, InputError where a later version wrote it."""
+        """Open an existing store; StoreLost where there is none, InputError where a later version wrote it."""
         attributes = _read_group(url)
         if attributes is None:
-            raise NotFound("there is no light-field store", where=url)
+            raise _store_lost(url, "it is not there")
         if attributes.get("format") != "lightkiln.light-field":
             raise InputError("the Zarr group is not a light-field store", where=url)
         if attributes["format_version"] > conventions.FORMAT_VERSION:
@@ -89,6 +107,22 @@ class LightFieldStore:
             )
         return cls(url, attributes)
 
+    def check(self) -> None:
+        """Raise StoreLost where the store is no longer there: what is written now would be found by nobody."""
+        if _read_group(self.url) is None:
+            raise _store_lost(self.url, "it is not there any more")
+
+    @contextmanager
+    def all_lost(self, names: Sequence[str], tiles: Mapping[Tile, Index]) -> Iterator[None]:
+        """Where a tile is lost in the block, raise TilesLost of all that are, each with its covered texels [T]."""
+        try:
+            yield
+        except TilesLost as error:
+            lost = self.lost_tiles(names, tiles)
+            if not lost:
+                raise
+            raise self._lost(" or ".join(names), lost, f"cannot be read; the first: {error.detail}") from error
+
     def write_texel_map(self, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         """Keep `position`, `normal` [H, W, 3], `alpha` and `state` [H, W] with the light fields."""
         if set(arrays) != set(layout.TEXEL_MAP_ARRAYS):
@@ -98,9 +132,20 @@ class LightFieldStore:
             self._write_array(name, values.astype(layout.TEXEL_MAP_ARRAYS[name][0]))
 
     def read_texel_map(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays of `write_texel_map`."""
-        with translated_errors(self.url):
-            return {name: np.asarray(self._array(name).read().result()) for name in layout.TEXEL_MAP_ARRAYS}
+        """The arrays of `write_texel_map`; StoreLost where a part of them is not there, or its bytes are damaged."""
+        out = {}
+        for name in layout.TEXEL_MAP_ARRAYS:
+            array = self._array(name)
+            try:
+                out[name] = np.asarray(array.read().result())
+                stored = array.storage_statistics(query_fully_stored=True).result().fully_stored
+            except ValueError as error:
+                if not is_damage(error):
+                    raise translated(self.url, error) from error
+                raise _store_lost(self.url, f"its texel map is damaged ({first_words(error)})") from error
+            if not stored:
+                raise _store_lost(self.url, f"parts of '{name}' of its texel map are gone")
+        return out
 
     def write_tile(
         self, tile: Tile, covered: Index, light_field: Float16, visibility: Float16 | None, irradiance: Float32
@@ -130,35 +175,79 @@ class LightFieldStore:
         self._write_texels(conventions.ARRAY_BETWEEN, tile, texels, images)
 
     def read_between(self, tile: Tile, texels: Index) -> Float16:
-        """Sparse light fields [B, 3, R/2, R/2, 3] of the texels [B] (row-major inside the tile); NotFound without."""
+        """Sparse light fields [B, 3, R/2, R/2, 3] of the texels [B] (row-major inside the tile).
+
+        NotFound where the store keeps none; TilesLost where one of them is not there, or its bytes are damaged.
+        """
         if not self.has_between:
             raise NotFound("the store holds no light fields between texels", where=self.url)
         return self._read_texels(conventions.ARRAY_BETWEEN, tile, texels)
 
     def read_tile(self, function: Function, tile: Tile, covered: Index) -> Float16:
-        """Images [T, R, R, 3] of the texels `covered` [T] (row-major inside the tile); NotFound without a shard."""
+        """Images [T, R, R, 3] of the texels `covered` [T] (row-major inside the tile).
+
+        TilesLost where one of them is not there, or its bytes are damaged.
+        """
         if function not in self.functions:
             raise NotFound(f"the store has no {function.value}", where=self.url)
         return self._read_texels(function.value, tile, covered)
 
-    def read_irradiance(self) -> Float32:
-        """Irradiance [H, W, 3]; zero where nothing was written."""
-        with translated_errors(self.url):
-            return np.asarray(self._array(conventions.ARRAY_IRRADIANCE).read().result())
+    def read_irradiance(self, tiles: Iterable[Tile]) -> Float32:
+        """Irradiance [H, W, 3] of tiles, zero elsewhere; TilesLost where one of them is not there."""
+        array = self._array(conventions.ARRAY_IRRADIANCE)
+        out, lost = np.zeros((*self.shape, 3), np.float32), []
+        for tile in tiles:
+            rows = slice(tile.row, min(tile.row + tile.size, self.shape[0]))
+            columns = slice(tile.column, min(tile.column + tile.size, self.shape[1]))
+            try:
+                out[rows, columns] = self._stored(conventions.ARRAY_IRRADIANCE, tile, array[rows, columns])
+            except TilesLost:
+                lost.append(tile)
+        if lost:
+            raise self._lost(conventions.ARRAY_IRRADIANCE, lost, "are gone or damaged")
+        return out
+
+    def lost_tiles(self, names: Iterable[str], tiles: Mapping[Tile, Index]) -> list[Tile]:
+        """Those of the tiles, each with its covered texels [T], that cannot be read from all of these arrays."""
+        lost = []
+        for tile, covered in tiles.items():
+            try:
+                for name in names:
+                    self._read_texels(name, tile, covered)
+            except TilesLost:
+                lost.append(tile)
+        return lost
 
     def _read_texels(self, name: str, tile: Tile, covered: Index) -> Float16:
-        array = self._array(name)
-        dimensions = "/0" * (array.rank - 2)
-        key = f"c/{tile.row // self.tile_size}/{tile.column // self.tile_size}{dimensions}"
         rows, columns = self._positions(tile, covered)
-        with translated_errors(self.url):
-            if not array.kvstore.list(ts.KvStore.KeyRange(key, key + "\0")).result():
-                raise NotFound(
-                    f"{name} has no tile at row {tile.row}, column {tile.column}",
-                    where=self.url,
-                    remedy="Render the tile again.",
-                )
-            return np.asarray(array[rows, columns].read().result())
+        values: Float16 = self._stored(name, tile, self._array(name)[rows, columns])
+        # A texel that was never written is zero in all its bits, as is a black one: only of those the store is asked.
+        zero = ~values.reshape(len(values), -1).view(np.uint8).any(axis=1)
+        if zero.any() and not zero.all():
+            self._stored(name, tile, self._array(name)[rows[zero], columns[zero]])
+        return values
+
+    def _stored(self, name: str, tile: Tile, part: Any) -> Any:
+        """The values of a part of a tile; TilesLost where they are damaged, or zeros that nobody has stored."""
+        try:
+            values = np.asarray(part.read().result())
+            if values.any() or not values.size:
+                return values
+            stored = part.storage_statistics(query_fully_stored=True).result().fully_stored
+        except ValueError as error:
+            if not is_damage(error):
+                raise translated(self.url, error) from error
+            raise self._lost(name, [tile], f"are damaged ({first_words(error)})") from error
+        if not stored:
+            raise self._lost(name, [tile], "are gone")
+        return values
+
+    def _lost(self, name: str, tiles: Sequence[Tile], what: str) -> TilesLost:
+        labels = tuple(tile.label for tile in tiles)
+        named = ", ".join(labels[:8]) + (f" and {len(labels) - 8} more" if len(labels) > 8 else "")
+        return TilesLost(
+            f"chunks of {name} of {named} {what}", where=self.url, remedy="Render them again.", labels=labels
+        )
 
     def _write_array(self, name: str, values: npt.NDArray[Any]) -> None:
         array = self._array(name)
@@ -172,7 +261,19 @@ class LightFieldStore:
             with ts.Transaction() as transaction:
                 array.with_transaction(transaction)[rows, columns].write(values).result()
 
-        write_patiently(self.url, write)
+        def write_anew() -> None:
+            try:
+                write()
+            except ValueError as error:
+                if not is_damage(error):
+                    raise
+                # A shard is read before some of its texels are replaced: a damaged one has to go first.
+                tail = "/0" * (array.rank - 2)
+                at = f"c/{tile.row // self.tile_size}/{tile.column // self.tile_size}{tail}"
+                array.kvstore.write(at, None).result()
+                write()
+
+        write_patiently(self.url, write_anew)
 
     def _positions(self, tile: Tile, covered: Index) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         aligned = tile.row % self.tile_size == 0 and tile.column % self.tile_size == 0 and tile.size == self.tile_size
@@ -196,7 +297,7 @@ class LightFieldStore:
             self._arrays[name] = self._open_array(name, create=False)
         return self._arrays[name]
 
-    def _open_array(self, name: str, *, create: bool) -> Any:
+    def _open_array(self, name: str, *, create: bool, delete_existing: bool = False) -> Any:
         base = kvstore_spec(self.url)
         spec = {
             "driver": "zarr3",
@@ -205,8 +306,13 @@ class LightFieldStore:
             # A covered texel may be black: store its zeros, so that absent means no surface.
             "store_data_equal_to_fill_value": True,
         }
-        with translated_errors(self.url):
-            return ts.open(spec, open=True, create=create, context=self._context).result()
+        mode = {"open": not delete_existing, "create": create, "delete_existing": delete_existing}
+        try:
+            return ts.open(spec | mode, context=self._context).result()
+        except ValueError as error:
+            if is_damage(error) and not is_difference(error):
+                raise _store_lost(self.url, f"its array '{name}' is gone or damaged ({first_words(error)})") from error
+            raise translated(self.url, error) from error
 
     def _refuse_not_finite(self, values: npt.NDArray[Any], name: str) -> None:
         if not np.isfinite(values).all():
@@ -222,13 +328,26 @@ def _read_group(url: str) -> dict[str, Any] | None:
     """The attributes of the group at `url`, None where there is no group."""
     with translated_errors(url):
         found = _kvstore(url).read(_GROUP_KEY).result()
-        if found.state != "value":
-            return None
+    if found.state != "value":
+        return None
+    try:
         document = json.loads(found.value)
+    except (ValueError, RecursionError) as error:
+        raise _store_lost(url, f"its zarr.json is damaged ({type(error).__name__})") from None
+    if not isinstance(document, dict) or "node_type" not in document:
+        raise _store_lost(url, "its zarr.json is damaged")
     attributes = document.get("attributes")
-    if document.get("node_type") != "group" or not isinstance(attributes, dict):
+    if document["node_type"] != "group" or not isinstance(attributes, dict):
         raise InputError("zarr.json there is not a group's", where=url)
     return attributes
+
+
+def _store_lost(url: str, what: str) -> StoreLost:
+    return StoreLost(
+        f"the light-field store cannot be used: {what}",
+        where=url,
+        remedy="Check that this machine has the store's disk mounted; if it has, retry the job to render it again.",
+    )
 
 
 def _refuse_difference(url: str, found: Mapping[str, Any], mine: Mapping[str, Any]) -> None:

@@ -21,6 +21,7 @@ FULL_PATIENCE_S: Final = 60.0
 """A full disk is tried again for so long: all of a farm's attempts at a task would otherwise end in seconds."""
 PAUSE_S: Final = (0.5, 5.0)
 """First and longest pause between two tries."""
+_DAMAGE = ("DATA_LOSS", "FAILED_PRECONDITION", "INVALID_ARGUMENT", "OUT_OF_RANGE", "NOT_FOUND")
 _PASSING = ("No space left", "Disk quota")
 """What ends when somebody frees space; a file's greatest size, for one, does not."""
 _DISK = ("No space left", "File too large", "Disk quota", "RESOURCE_EXHAUSTED")
@@ -63,6 +64,26 @@ def translated_errors(url: str) -> Iterator[None]:
         raise _translate(url, str(error)) from error
 
 
+def translated(url: str, error: Exception) -> KilnError:
+    """tensorstore's error as ours; the place named is the store's URL."""
+    return _translate(url, str(error))
+
+
+def is_damage(error: Exception) -> bool:
+    """Whether a failed read or opening means that what lies there is gone, cut off or has wrong bytes."""
+    return str(error).startswith(_DAMAGE) and not any(sign in str(error) for sign in (*_DISK, *_DENIED))
+
+
+def is_difference(error: Exception) -> bool:
+    """Whether an array lies there that is whole, but another one."""
+    return "Expected" in str(error) and "but received" in str(error) and "Error parsing" not in str(error)
+
+
+def first_words(error: Exception) -> str:
+    """What tensorstore says, without where in its source it says so."""
+    return str(error).split(" [tensorstore_spec", maxsplit=1)[0].split(" [source locations", maxsplit=1)[0]
+
+
 def write_patiently(url: str, write: Callable[[], object]) -> None:
     """Call `write`, which may be repeated, until the disk of the store has space for it or the patience is over."""
     deadline, pause = time.monotonic() + FULL_PATIENCE_S, PAUSE_S[0]
@@ -80,7 +101,7 @@ def write_patiently(url: str, write: Callable[[], object]) -> None:
 
 
 def _translate(url: str, text: str) -> KilnError:
-    cause = text.split(" [tensorstore_spec", maxsplit=1)[0].split(" [source locations", maxsplit=1)[0]
+    cause = first_words(ValueError(text))
     if any(sign in text for sign in _DISK):
         return MachineLacks(
             f"the store cannot take more data ({cause})",
