@@ -2,10 +2,13 @@
 
 import hashlib
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 
 from kiln_schemas.errors import InputError, InternalError
 from kiln_workers.package import ktx2
@@ -159,3 +162,47 @@ def test_writer_refuses_infinities_and_wrong_mips(tmp_path: Path) -> None:
     with pytest.raises(InternalError, match="mip 1"):
         ktx2.write(tmp_path / "t.ktx2", ktx2.texture_cube([halves(6, 8, 8, 4), halves(6, 3, 3, 4)], {}))
     assert list(tmp_path.iterdir()) == []
+
+
+def bomb(side: int, layers: int, inflated: int) -> bytes:
+    """A valid file that declares `layers` of side x side texels and whose frame inflates to `inflated` zeros."""
+    small = ktx2.encode(ktx2.texture_array(np.zeros((2, 4, 4, 4), np.float16), {}), supercompress=True)
+    data = bytearray(small)
+    struct.pack_into("<2I", data, 20, side, side)
+    struct.pack_into("<I", data, 32, layers)
+    offset, _, _ = struct.unpack_from("<3Q", data, 80)
+    compressor = zstandard.ZstdCompressor(level=19).compressobj()
+    zeros = bytes(1 << 20)
+    frame = b"".join([compressor.compress(zeros) for _ in range(inflated >> 20)]) + compressor.flush()
+    struct.pack_into("<3Q", data, 80, offset, len(frame), 8 * side * side * layers)
+    return bytes(data[:offset]) + frame
+
+
+_READ = """
+import resource, sys
+from pathlib import Path
+from kiln_schemas.errors import InputError
+from kiln_workers.package import ktx2
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    ktx2.read(Path(sys.argv[1]), int(sys.argv[2]) or None)
+except InputError as error:
+    print(error)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
+"""
+
+
+@pytest.mark.parametrize(
+    ("side", "layers", "inflated", "most", "words"),
+    [(8192, 6, 3 << 30, 10**6, "the package's settings allow 1000000"), (8, 2, 3 << 30, 0, "inflates to more than")],
+)
+def test_a_small_file_that_inflates_to_gigabytes_takes_no_memory(
+    tmp_path: Path, side: int, layers: int, inflated: int, most: int, words: str
+) -> None:
+    """3 GiB of zeros in 100 KB: declared and refused by the settings, or not declared and cut short."""
+    path = tmp_path / "bomb.ktx2"
+    path.write_bytes(bomb(side, layers, inflated))
+    assert path.stat().st_size < 400_000
+    command = [sys.executable, "-c", _READ, str(path), str(most)]
+    told, grown = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert words in told and int(grown) < 100

@@ -13,7 +13,9 @@ from pathlib import Path
 import httpx
 import pytest
 
+from kiln_service.blobs import Blobs
 from kiln_service.config import Limits, Timing
+from kiln_service.db import Database
 
 DATA = bytes(range(256)) * 8192  # 2 MiB
 SHA256 = hashlib.sha256(DATA).hexdigest()
@@ -150,3 +152,81 @@ def test_blobs_that_nothing_uses_are_collected(start, eventually):
         assert home.client.get(f"/v1/blobs/{used}").status_code == 200
         assert home.upload(b"nobody wants me") == unused
         assert home.client.get(f"/v1/blobs/{unused}").content == b"nobody wants me"
+
+
+def test_a_token_may_store_only_so_much_that_no_job_uses(start):
+    """By bytes and by number; what a job uses counts no more, nor what was collected, nor does it keep others out."""
+    limits = Limits(reserve_bytes=0, unused_bytes=10_000, unused_blobs=4)
+    with start(limits=limits) as home:
+        made = home.client.post("/v1/tokens", json={"name": "farm", "scopes": ["worker"]}).json()["token"]
+        other = {"Authorization": f"Bearer {made}"}
+
+        def put(data, **headers):
+            return home.client.put(f"/v1/blobs/{hashlib.sha256(data).hexdigest()}", content=data, headers=headers)
+
+        assert put(b"a" * 6000).status_code == 201
+        for body in (b"b" * 6000, iter([b"b" * 3000, b"b" * 3000])):
+            sha256 = hashlib.sha256(b"b" * 6000).hexdigest()
+            refused = home.client.put(f"/v1/blobs/{sha256}", content=body)
+            assert refused.status_code == 507 and refused.json()["code"] == "quota"
+            assert "12000 bytes" in refused.json()["detail"] and "10000 are allowed" in refused.json()["detail"]
+            assert refused.json()["where"] == "limits.unused_bytes" and refused.json()["remedy"]
+        assert list(home.config.incoming.iterdir()) == []
+        assert put(b"b" * 6000, **other).status_code == 201
+        bundle = {"entry": "scene.glb", "files": {"scene.glb": hashlib.sha256(b"a" * 6000).hexdigest()}}
+        home.client.post("/v1/jobs", json={"name": "t", "bundle": bundle, "preset": "draft"}).raise_for_status()
+        assert put(b"c" * 6000).status_code == 201, "the job uses the first"
+        assert [put(bytes([number])).status_code for number in range(4)] == [201, 201, 201, 507]
+        home.sql("UPDATE blobs SET touched = now() - interval '1 day'")
+        assert asyncio.run(collected(home)) == 5
+        assert put(b"d" * 6000).status_code == 201
+
+
+async def collected(home):
+    """How many blobs a collection frees, with a connection of its own."""
+    async with Database(home.config.database) as database:
+        return await Blobs(database, home.config).collect(3600)
+
+
+def test_an_artifact_of_another_size_than_its_blob_is_refused(home, result):
+    job, worker = home.submit(), home.worker()
+    while (claim := worker.must_claim())["payload"]["kind"] != "package":
+        worker.finish(claim)
+    package = result(home, claim)
+    package["artifacts"][0]["size"] += 1
+    refused = worker.commit(claim, package)
+    assert refused.status_code == 422 and "1001 bytes, its blob has 1000" in refused.json()["detail"]
+    assert home.job(job["id"])["state"] == "active"
+    worker.finish(claim)
+    assert home.job(job["id"])["state"] == "completed"
+
+
+def test_within_the_reserve_work_ends_and_nothing_begins(start):
+    """On a disk as full as that uploads, jobs, tasks and log lines stop; commits, heartbeats and cancel go on."""
+    with start() as home:
+        request = home.request()
+        job, other = home.submit(), home.submit(name="other")
+        worker = home.worker()
+        prepare = worker.must_claim("prepare")
+        made = {"seconds": 1.0, "kind": "prepare", "scene": home.upload(b"s")}
+        tiles = [{"row": 0, "column": 0, "size": 8, "texels": 5}]
+        made |= {"texel_map": home.upload(b"t"), "scene_hash": "0" * 64, "tiles": tiles, "has_light": True}
+        made |= {"has_environment": False, "triangles": 1}
+    with start(limits=Limits(reserve_bytes=2**60)) as full:
+        worker.home = full
+        assert full.client.put(f"/v1/blobs/{SHA256}", content=DATA).status_code == 507
+        refused = full.client.post("/v1/jobs", json=request)
+        assert refused.status_code == 507 and "reserve" in refused.json()["detail"]
+        assert worker.claim() is None
+        assert worker.beat(prepare, log="a line\n")["stop"] is False
+        assert full.client.get(f"/v1/tasks/{prepare['task_id']}/log").text == ""
+        assert worker.commit(prepare, made).status_code == 204
+        assert full.job(job["id"])["stages"][0]["completed"] == 1
+        assert full.client.post(f"/v1/jobs/{other['id']}/cancel").status_code == 200
+        assert full.job(other["id"])["state"] == "canceled"
+        assert full.client.post(f"/v1/jobs/{other['id']}/archive").status_code == 200
+        assert full.client.post("/v1/gc", json={}).status_code == 200
+        assert worker.claim() is None
+    with start() as home:
+        worker.home = home
+        assert worker.must_claim("render") is not None

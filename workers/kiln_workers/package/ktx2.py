@@ -5,9 +5,11 @@ data format descriptor. Texel data lie [layer, face, row, column, channel] insid
 first in the file. `kiln_workers.package.ktx2_validate` checks files from the specification without this module.
 """
 
+import os
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
 from typing import Final
 
@@ -16,7 +18,7 @@ import numpy.typing as npt
 import zstandard
 
 from kiln_schemas import __version__
-from kiln_schemas.errors import InputError, InternalError
+from kiln_schemas.errors import InputError, InternalError, TooLarge
 from kiln_schemas.files import open_regular
 from kiln_workers.package.files import write_bytes
 from kiln_workers.package.ktx2_validate import validate
@@ -29,6 +31,9 @@ TEXEL_BYTES: Final = 8
 SCHEME_NONE: Final = 0
 SCHEME_ZSTD: Final = 2
 ZSTD_LEVEL: Final = 9
+
+OVERHEAD_BYTES: Final = 2**16
+"""What a file has besides its texels, at most."""
 
 _HEADER: Final = struct.Struct("<12s9I")
 _INDEX: Final = struct.Struct("<4I2Q")
@@ -140,14 +145,38 @@ def decode(data: bytes, *, where: str = "KTX2") -> Texture:
     return Texture(tuple(levels), layer_count > 0, metadata)
 
 
-def read(path: Path) -> Texture:
-    """Read and check a half-float KTX 2.0 file; InputError names the first fault."""
+def read(path: Path, most_bytes: int | None = None) -> Texture:
+    """Read and check a half-float KTX 2.0 file; InputError names the first fault.
+
+    TooLarge, before anything is inflated, where its levels would take more than `most_bytes`, which the caller knows of
+    the package's settings.
+    """
     try:
         with open_regular(path) as file:
+            if most_bytes is not None:
+                _refuse_larger(file, path.name, most_bytes)
             data = file.read()
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=path.name) from None
     return decode(data, where=path.name)
+
+
+def _refuse_larger(file: BufferedReader, name: str, most_bytes: int) -> None:
+    """TooLarge where a file, or what its header declares, is larger than that; other faults are `decode`'s to find."""
+    head = file.read(_HEADER.size)
+    file.seek(0)
+    if len(head) < _HEADER.size:
+        return
+    _, _, _, width, height, _, layers, faces, levels, _ = _HEADER.unpack(head)
+    shapes = ((max(1, height >> level), max(1, width >> level)) for level in range(min(max(1, levels), 32)))
+    declared = TEXEL_BYTES * max(1, layers) * faces * sum(rows * columns for rows, columns in shapes)
+    for size, what in ((declared, "its texels take"), (os.fstat(file.fileno()).st_size - OVERHEAD_BYTES, "it has")):
+        if size > most_bytes:
+            raise TooLarge(
+                f"{what} {size} bytes, the package's settings allow {most_bytes}",
+                where=name,
+                remedy="Bake or download the package again.",
+            )
 
 
 def _check(texture: Texture) -> None:

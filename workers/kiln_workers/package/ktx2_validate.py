@@ -30,6 +30,9 @@ _HEADER_FIELDS: Final = (
     "sgdByteOffset",
     "sgdByteLength",
 )
+PIECE_BYTES: Final = 1024
+"""A frame is inflated in pieces that each give 32 MiB at most: a block of 128 KiB takes 4 bytes (RFC 8878, 3.1.1.2)."""
+WINDOW_BYTES: Final = 2**27
 _RESERVED_KEYS: Final = {
     "KTXcubemapIncomplete",
     "KTXorientation",
@@ -213,13 +216,17 @@ def _check_levels(file: _File) -> None:
 
 def _check_frame(file: _File, name: str, data: bytes, plain: int) -> None:
     """A supercompressed level must be one Zstandard frame that inflates to the stated length."""
+    inflater = zstandard.ZstdDecompressor(max_window_size=WINDOW_BYTES).decompressobj()
+    found = end = 0
     try:
-        inflater = zstandard.ZstdDecompressor().decompressobj()
-        found = len(inflater.decompress(data))
+        while end < len(data) and not inflater.eof and found <= plain:
+            found += len(inflater.decompress(data[end : end + PIECE_BYTES]))
+            end += PIECE_BYTES
     except zstandard.ZstdError as error:
         file.require(False, f"{name}: not a Zstandard frame ({error})")
         return
-    file.require(
-        inflater.eof and not inflater.unused_data, f"{name}: the Zstandard frame is cut off or followed by more"
-    )
+    if not file.require(found <= plain, f"{name}: inflates to more than its uncompressedByteLength of {plain}"):
+        return
+    whole = inflater.eof and not inflater.unused_data and end >= len(data)
+    file.require(whole, f"{name}: the Zstandard frame is cut off or followed by more")
     file.require(found == plain, f"{name}: inflates to {found} bytes, uncompressedByteLength is {plain}")

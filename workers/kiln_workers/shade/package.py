@@ -4,9 +4,10 @@ Nothing comes from the store, the network or the bundle: what is wrong here is w
 `Incident` is the seam to `stored`, which answers the same questions from the light-field store instead.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Any, Final, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -20,12 +21,13 @@ from kiln_schemas.conventions import (
     ENVIRONMENT_U_KTX2,
     FORMAT_VERSION,
     IRRADIANCE_EXR,
+    LAYERS_PER_LOBE,
     LIGHT_FIELD_KTX2,
     MANIFEST_JSON,
     SCENE_GLB,
     VISIBILITY_KTX2,
 )
-from kiln_schemas.errors import InputError, NotFound
+from kiln_schemas.errors import InputError, NotFound, TooLarge
 from kiln_schemas.files import open_regular, read_small
 from kiln_schemas.manifest import Manifest
 from kiln_workers.package import ktx2
@@ -35,6 +37,12 @@ from kiln_workers.scene.model import Scene
 from kiln_workers.shade import algorithm, textures
 
 Float32 = npt.NDArray[np.float32]
+
+MOST_PIXELS: Final = 2**27
+MOST_CHANNELS: Final = 16
+MOST_U_LAYERS: Final = 64
+CUBE_SIDES: Final = 8
+"""Six, and all their mips."""
 
 
 class Incident(Protocol):
@@ -120,12 +128,12 @@ class ShadePackage:
         for mesh in scene.meshes:
             if mesh.lightmap_uv is None:
                 raise InputError("has no TEXCOORD_1", where=f"{folder / SCENE_GLB}: {mesh.name}")
-        visible = _lobes(folder, VISIBILITY_KTX2, device) if VISIBILITY_KTX2 in manifest.textures else None
+        visible = _lobes(folder, VISIBILITY_KTX2, manifest, device) if VISIBILITY_KTX2 in manifest.textures else None
         return cls(
             manifest=manifest,
             scene=scene,
-            irradiance=torch.from_numpy(read_exr(folder / IRRADIANCE_EXR)).to(device),
-            lobes=LobeTextures(_lobes(folder, LIGHT_FIELD_KTX2, device), visible),
+            irradiance=torch.from_numpy(read_exr(folder / IRRADIANCE_EXR, _texels(manifest))).to(device),
+            lobes=LobeTextures(_lobes(folder, LIGHT_FIELD_KTX2, manifest, device), visible),
             environment=_environment(folder, manifest, device),
         )
 
@@ -151,21 +159,42 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
-def read_exr(path: Path) -> Float32:
-    """Linear RGB [H, W, 3] of an EXR; InputError where it cannot be read."""
+def read_exr(path: Path, most_texels: int = MOST_PIXELS) -> Float32:
+    """Linear RGB [H, W, 3] of an EXR; InputError where it cannot be read, TooLarge where it declares more texels."""
     try:
         # By its descriptor: the library opens by name, and would wait for a pipe.
-        with open_regular(path) as regular, OpenEXR.File(f"/dev/fd/{regular.fileno()}") as file:
-            channels = file.channels()
-            if "RGB" not in channels:
-                raise InputError(f"has the channels {', '.join(channels)} instead of R, G, B", where=str(path))
-            return np.array(channels["RGB"].pixels, dtype=np.float32)
+        with open_regular(path) as regular:
+            name = f"/dev/fd/{regular.fileno()}"
+            with OpenEXR.File(name, header_only=True) as file:
+                _refuse_larger(file.header(), path, most_texels)
+            with OpenEXR.File(name) as file:
+                channels = file.channels()
+                if "RGB" not in channels:
+                    raise InputError(f"has the channels {', '.join(channels)} instead of R, G, B", where=str(path))
+                return np.array(channels["RGB"].pixels, dtype=np.float32)
     except (RuntimeError, OSError, ValueError) as error:
         raise InputError(f"cannot be read as OpenEXR: {error}", where=str(path)) from None
 
 
-def _lobes(folder: Path, name: str, device: torch.device) -> Tensor:
-    texture = ktx2.read(folder / name)
+def _refuse_larger(header: Mapping[str, Any], path: Path, most_texels: int) -> None:
+    """TooLarge where an EXR's header declares more than may be read."""
+    (left, top), (right, bottom) = (corner.tolist() for corner in header["dataWindow"])
+    texels, channels = (right - left + 1) * (bottom - top + 1), len(header["channels"])
+    if texels > most_texels or channels > MOST_CHANNELS:
+        raise TooLarge(
+            f"it declares {texels} texels of {channels} channels; {most_texels} of {MOST_CHANNELS} are allowed",
+            where=str(path),
+        )
+
+
+def _texels(manifest: Manifest) -> int:
+    """Texels of the light map."""
+    return manifest.settings.lightmap.resolution**2
+
+
+def _lobes(folder: Path, name: str, manifest: Manifest, device: torch.device) -> Tensor:
+    most = ktx2.TEXEL_BYTES * LAYERS_PER_LOBE * manifest.settings.fit.lobes * _texels(manifest)
+    texture = ktx2.read(folder / name, most)
     return torch.from_numpy(layers_to_lobes(texture.levels[0][:, 0])).to(device)
 
 
@@ -173,10 +202,11 @@ def _environment(folder: Path, manifest: Manifest, device: torch.device) -> Envi
     described = manifest.textures.get(ENVIRONMENT_U_KTX2)
     if described is None:
         return None
-    layers = ktx2.read(folder / ENVIRONMENT_U_KTX2).levels[0][:, 0, ..., :3].astype(np.float32)
+    size = ktx2.TEXEL_BYTES * manifest.settings.package.environment_size**2
+    layers = ktx2.read(folder / ENVIRONMENT_U_KTX2, MOST_U_LAYERS * size).levels[0][:, 0, ..., :3].astype(np.float32)
     if described["normalised"]:
         layers = layers * np.asarray(described["lobe_integrals"], np.float32)[:, None, None, None]
-    cube = ktx2.read(folder / ENVIRONMENT_GGX_KTX2).levels[0][0, ..., :3].astype(np.float32)
+    cube = ktx2.read(folder / ENVIRONMENT_GGX_KTX2, CUBE_SIDES * size).levels[0][0, ..., :3].astype(np.float32)
     return EnvironmentLookup(
         torch.from_numpy(layers).to(device),
         torch.tensor(described["alphas"], dtype=torch.float32, device=device),

@@ -8,12 +8,12 @@ import { KHR_SUPERCOMPRESSION_NONE, KHR_SUPERCOMPRESSION_ZSTD, read } from "../v
 const RGBA16F = 97; // VK_FORMAT_R16G16B16A16_SFLOAT
 const TEXEL_BYTES = 8;
 
-self.onmessage = async ({ data: { name, url } }) => {
+self.onmessage = async ({ data: { name, url, described } }) => {
   try {
     const response = await fetch(url);
     if (!response.ok) throw new Error(`the server answered ${response.status}`);
     const bytes = new Uint8Array(await response.arrayBuffer());
-    const texture = await decode(bytes);
+    const texture = await decode(bytes, described);
     self.postMessage({ name, texture: { ...texture, fileBytes: bytes.length } }, texture.levels.map((level) => level.buffer));
   } catch (error) {
     self.postMessage({ name, error: error.message });
@@ -21,11 +21,17 @@ self.onmessage = async ({ data: { name, url } }) => {
 };
 
 // Levels are Uint16Array, [layer][face][row][column][RGBA], row 0 at the top.
-async function decode(bytes) {
+// Nothing is inflated of a file that declares another size than the manifest does.
+async function decode(bytes, described) {
   const file = read(bytes);
   if (file.vkFormat !== RGBA16F) throw new Error(`its format is ${file.vkFormat}, not RGBA16F`);
   const { pixelWidth: width, pixelHeight: height, faceCount: faces } = file;
   const layers = Math.max(1, file.layerCount);
+  const declared = { width, height, layers, faces };
+  for (const [key, value] of Object.entries(declared)) {
+    if (value !== described[key]) throw new Error(`it has ${value} as its ${key}; the manifest says ${described[key]}`);
+  }
+  if (file.levels.length > 1 + Math.log2(Math.max(width, height))) throw new Error(`it has ${file.levels.length} levels`);
   const levels = [];
   for (const [number, level] of file.levels.entries()) {
     const size = Math.max(1, width >> number) * Math.max(1, height >> number) * layers * faces * TEXEL_BYTES;

@@ -26,10 +26,9 @@ export async function openPackage(folder, told = () => {}) {
   };
   const [glb, textures, ...shaders] = await Promise.all([
     part(get(folder, "scene.glb").then((response) => response.arrayBuffer())),
-    readTextures(folder, names, part),
+    readTextures(folder, names, manifest, part),
     ...SHADERS.map((name) => part(get(folder, `shaders/${name}`).then((response) => response.text()))),
   ]);
-  for (const [name, texture] of Object.entries(textures)) checkShape(name, texture, manifest.textures[name]);
   const bytes = glb.byteLength + Object.values(textures).reduce((sum, texture) => sum + texture.fileBytes, 0);
   return {
     manifest,
@@ -47,7 +46,7 @@ async function get(folder, name) {
 }
 
 // Decoded textures by name, read and decoded in one worker.
-async function readTextures(folder, names, part) {
+async function readTextures(folder, names, manifest, part) {
   const worker = new Worker(new URL("./decode.js", import.meta.url), { type: "module" });
   const waiting = new Map();
   worker.onmessage = ({ data }) => {
@@ -61,7 +60,9 @@ async function readTextures(folder, names, part) {
   try {
     const entries = names.map(async (name) => {
       const texture = new Promise((resolve, reject) => waiting.set(name, { resolve, reject }));
-      worker.postMessage({ name, url: new URL(folder + name, location.href).href });
+      const described = manifest.textures[name];
+      checkSize(name, described, manifest.settings);
+      worker.postMessage({ name, url: new URL(folder + name, location.href).href, described });
       return [name, await part(texture)];
     });
     return Object.fromEntries(await Promise.all(entries));
@@ -70,10 +71,14 @@ async function readTextures(folder, names, part) {
   }
 }
 
-function checkShape(name, texture, described) {
-  for (const key of ["width", "height", "layers", "faces"]) {
-    if (texture[key] !== described[key]) {
-      throw new PackageError(`${name} has ${texture[key]} as its ${key}; the manifest says ${described[key]}.`);
+// What the manifest says of a texture has to fit the settings of the bake, which bound what is inflated.
+function checkSize(name, { width, height, layers, faces }, settings) {
+  const environment = name.startsWith("environment_");
+  const side = environment ? settings.package.environment_size : settings.lightmap.resolution;
+  const most = { width: side, height: side, layers: environment ? 64 : 2 * settings.fit.lobes, faces: 6 };
+  for (const [key, value] of Object.entries({ width, height, layers, faces })) {
+    if (!Number.isInteger(value) || value < 1 || value > most[key]) {
+      throw new PackageError(`${name} has ${value} as its ${key}; the settings of the bake allow 1 to ${most[key]}.`);
     }
   }
 }
