@@ -130,17 +130,17 @@ def test_a_damaged_file_of_the_bundle_fails_the_job_until_it_is_uploaded_again(p
     home = place.home
     request = home.request(bundle={"entry": "a/scene.glb", "files": {"a/scene.glb": home.upload(DATA)}})
     job = home.client.post("/v1/jobs", json=request).json()
-    claim = home.worker().must_claim("prepare")
+    worker = home.worker()
+    claim = worker.must_claim("prepare")
     place.damage(SHA256, how)
     assert read(home, SHA256).status_code == 404
     failed = home.job(job["id"])
     assert failed["state"] == "failed" and "a/scene.glb" in failed["error"]["detail"]
-    assert home.worker().beat(claim)["stop"] is True
+    assert worker.beat(claim)["stop"] is True
     refused = home.client.post(f"/v1/jobs/{job['id']}/retry")
     assert refused.status_code == 404 and "a/scene.glb" in refused.json()["detail"]
     home.upload(DATA)
     assert home.client.post(f"/v1/jobs/{job['id']}/retry").status_code == 200
-    worker = home.worker()
     while (claim := worker.claim()) is not None:
         worker.finish(claim)
     assert home.job(job["id"])["state"] == "completed"

@@ -56,7 +56,7 @@ def write_package(
         mips = [opaque(mip) for mip in ggx_prefilter(scene.environment, 32, 4, "cpu")]
         write(conventions.ENVIRONMENT_GGX_KTX2, ktx2.texture_cube(mips, {}))
         exr.write_rgb(folder / conventions.ENVIRONMENT_EXR, opaque(panorama(scene.environment, 256))[..., :3])
-    (folder / conventions.MANIFEST_JSON).write_text(_manifest(textures).model_dump_json())
+    (folder / conventions.MANIFEST_JSON).write_text(_manifest(textures, size * tiles, lobes).model_dump_json())
     return folder
 
 
@@ -82,14 +82,14 @@ def smooth_lobes(size: int, count: int, scale: float) -> np.ndarray:
     return lobes
 
 
-def _manifest(textures: dict[str, dict[str, object]]) -> Manifest:
+def _manifest(textures: dict[str, dict[str, object]], resolution: int, lobes: int) -> Manifest:
     fitted = FitMetrics(log_mse=0.1, log_mse_zero=1.0, log_mse_rel=0.1, texels=1024, signal=True)
     return Manifest(
         format_version=conventions.FORMAT_VERSION,
         generator="test",
         job_id="1",
         job_name="scene",
-        settings=make_settings("draft", ()),
+        settings=make_settings("draft", [f"lightmap.resolution={resolution}", f"fit.lobes={lobes}"]),
         scene_hash="a" * 64,
         inputs={},
         environment=None,

@@ -108,7 +108,13 @@ def test_compressed_textures_that_arrive_together_are_all_decoded(serve, viewer,
 
 @pytest.mark.parametrize(
     ("fault", "sentence"),
-    [("webgl", "has no WebGL2"), ("version", "format version 99"), ("texture", "lightfield.ktx2 cannot be read")],
+    [
+        ("webgl", "has no WebGL2"),
+        ("version", "format version 99"),
+        ("texture", "lightfield.ktx2 cannot be read"),
+        ("larger", "it has 16384 as its width; the manifest says 8"),
+        ("declared", "lightfield.ktx2 has 16384 as its width; the settings of the bake allow 1 to 8"),
+    ],
 )
 def test_what_cannot_work_is_said(fault, sentence, serve, viewer, tmp_path) -> None:
     folder = packages.write_package(tmp_path / "package", packages.cabinet_scene(), size=8, lobes=2)
@@ -118,6 +124,14 @@ def test_what_cannot_work_is_said(fault, sentence, serve, viewer, tmp_path) -> N
     elif fault == "version":
         manifest = json.loads((folder / conventions.MANIFEST_JSON).read_text())
         (folder / conventions.MANIFEST_JSON).write_text(json.dumps(manifest | {"format_version": 99}))
+    elif fault == "larger":
+        path = folder / conventions.LIGHT_FIELD_KTX2
+        data = path.read_bytes()
+        path.write_bytes(data[:20] + (16384).to_bytes(4, "little") + data[24:])
+    elif fault == "declared":
+        manifest = json.loads((folder / conventions.MANIFEST_JSON).read_text())
+        manifest["textures"][conventions.LIGHT_FIELD_KTX2]["width"] = 16384
+        (folder / conventions.MANIFEST_JSON).write_text(json.dumps(manifest))
     else:
         path = folder / conventions.LIGHT_FIELD_KTX2
         path.write_bytes(path.read_bytes()[:500])

@@ -70,7 +70,7 @@ async def irradiance(
     places = [_tile(word) for word in tile]
     fields = LightFields(job.store_url, job.settings)
     await fields.open()
-    return _bytes(await fields.irradiance(places, stride))
+    return _bytes(await fields.irradiance(places, stride, await _rendered(parts, job_id, places)))
 
 
 @router.get("/texels/{row}/{column}")
@@ -80,11 +80,14 @@ async def texel(job_id: str, row: Coordinate, column: Coordinate, parts: PartsHe
     if max(row, column) >= job.settings.lightmap.resolution:
         raise InputError(f"the light map has no texel {row}, {column}", where="texel")
     told: dict[str, Any] = {"row": row, "column": column, "image_size": job.settings.render.image_size, "missing": {}}
-    told["normal"] = await (await _texel_map(parts, job)).normal(row, column)
+    texel_map, side = await _texel_map(parts, job), job.settings.lightmap.tile
+    told["normal"] = await texel_map.normal(row, column)
+    rendered = await _rendered(parts, job_id, [(row // side * side, column // side * side)])
     try:
         fields = LightFields(job.store_url, job.settings)
         await fields.open()
-        told["image"] = base64.b64encode(await fields.image(row, column)).decode()
+        covered = bool(rendered) and await texel_map.has_surface(row, column)
+        told["image"] = base64.b64encode(await fields.image(row, column, covered)).decode()
     except KilnError as error:
         told["missing"]["image"] = error.problem().sentence()
     try:
@@ -115,6 +118,14 @@ async def _job(parts: Parts, job_id: str) -> JobRow:
     if row is None:
         raise NotFound(f"no job '{job_id}'", where="job")
     return JobRow.of(row)
+
+
+async def _rendered(parts: Parts, job_id: str, places: list[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Those of the tiles (row, column of the first texel) that are rendered: the store must have them."""
+    rows, columns = [row for row, _ in places], [column for _, column in places]
+    async with parts.database.transaction() as tx:
+        found = await tx.all("rendered_tiles", job_id=job_id, rows=rows, columns=columns)
+    return {(row["row"], row["column"]) for row in found}
 
 
 async def _texel_map(parts: Parts, job: JobRow) -> TexelMapReader:

@@ -2,21 +2,23 @@
 
 The layouts are those of `kiln_workers.store.layout` (Zarr v3: the irradiance has one uncompressed chunk a tile; a
 light-field shard is a tile, its chunks are texels, its index lies at the end) and `kiln_workers.scene.container` (texel
-map). What Zarr does not store is zero.
+map). What Zarr does not store is zero in tiles that are not rendered yet, and lost in those that are. Chunks and
+indices end in their CRC-32C, which is checked.
 """
 
 import asyncio
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Final
 
+import google_crc32c
 import obstore
 from obstore.exceptions import BaseError
 from obstore.store import ObjectStore
 
 from kiln_schemas.conventions import ARRAY_IRRADIANCE, ARRAY_LIGHT_FIELD
-from kiln_schemas.errors import InputError, NotFound
+from kiln_schemas.errors import Damaged, InputError, NotFound
 from kiln_schemas.settings import BakeSettings
 from kiln_service.blobs import Blobs, open_objects
 
@@ -48,20 +50,28 @@ class LightFields:
                 remedy="Mount the store on the coordinator's machine; a store whose job was collected is gone.",
             ) from None
 
-    async def irradiance(self, tiles: Sequence[tuple[int, int]], stride: int) -> bytes:
-        """float32 RGB of every `stride`-th texel of tiles (row, column of the first texel), one after the other."""
+    async def irradiance(
+        self, tiles: Sequence[tuple[int, int]], stride: int, rendered: Collection[tuple[int, int]]
+    ) -> bytes:
+        """float32 RGB of every `stride`-th texel of tiles (row, column of the first texel), one after the other.
+
+        Damaged where a tile that is `rendered` is not there or has wrong bytes; others are zero.
+        """
         gate = asyncio.Semaphore(AT_ONCE)
 
         async def one(row: int, column: int) -> bytes:
             async with gate:
-                return self._thinned(await self._tile(row, column), stride)
+                return self._thinned(await self._tile(row, column, (row, column) in rendered), stride)
 
         return b"".join(await asyncio.gather(*(one(row, column) for row, column in tiles)))
 
-    async def _tile(self, row: int, column: int) -> bytes:
-        size = self._settings.lightmap.tile
-        found = await self._read(self._key(ARRAY_IRRADIANCE, row, column, 1))
-        return bytes(12 * size * size) if found is None else found[: 12 * size * size]
+    async def _tile(self, row: int, column: int, rendered: bool) -> bytes:
+        size = 12 * self._settings.lightmap.tile**2
+        key = self._key(ARRAY_IRRADIANCE, row, column, 1)
+        found = await self._read(key, (0, size + CRC_BYTES))
+        if found is None and not rendered:
+            return bytes(size)
+        return self._checked(found, size, key)
 
     def _thinned(self, texels: bytes, stride: int) -> bytes:
         """Every `stride`-th texel of every `stride`-th row."""
@@ -76,24 +86,39 @@ class LightFields:
                 kept.append(values[start : start + 12])
         return b"".join(kept)
 
-    async def image(self, row: int, column: int) -> bytes:
-        """A texel's light field, float16 [R, R, 3]."""
+    async def image(self, row: int, column: int, rendered: bool) -> bytes:
+        """A texel's light field, float16 [R, R, 3]; Damaged where it is `rendered` and lost or wrong, else zero."""
         size, side = self._settings.lightmap.tile, self._settings.render.image_size
         wanted = 2 * 3 * side * side
         key = self._key(ARRAY_LIGHT_FIELD, row, column, 3)
         index_bytes = INDEX_ENTRY.size * size * size + CRC_BYTES
         index = await self._read(key, {"suffix": index_bytes})
-        if index is None:
+        if index is None and not rendered:
             return bytes(wanted)
-        if len(index) != index_bytes:
-            raise InputError("the shard is shorter than its index", where=key)
+        index = self._checked(index, index_bytes - CRC_BYTES, key)
         offset, length = INDEX_ENTRY.unpack_from(index, INDEX_ENTRY.size * (row % size * size + column % size))
-        if offset == ABSENT:
+        if offset == ABSENT and not rendered:
             return bytes(wanted)
         if length != wanted + CRC_BYTES:
-            raise InputError(f"the texel has {length} bytes, not {wanted + CRC_BYTES}", where=key)
-        chunk = await self._read(key, (offset, offset + length))
-        return bytes(wanted) if chunk is None else chunk[:wanted]
+            raise self._lost(key, "a texel is not stored")
+        return self._checked(await self._read(key, (offset, offset + length)), wanted, key)
+
+    def _checked(self, data: bytes | None, size: int, key: str) -> bytes:
+        """So many bytes without their checksum; Damaged where they are not there, or wrong."""
+        if data is None:
+            raise self._lost(key, "it is gone")
+        if len(data) != size + CRC_BYTES:
+            raise self._lost(key, f"it has {len(data)} bytes, not {size + CRC_BYTES}")
+        if google_crc32c.value(data[:size]) != int.from_bytes(data[size:], "little"):
+            raise self._lost(key, "its checksum is wrong")
+        return data[:size]
+
+    def _lost(self, key: str, what: str) -> Damaged:
+        return Damaged(
+            f"{key} of the light-field store is damaged or lost: {what}",
+            where=self._url,
+            remedy="Do the tile's task again (`lightkiln requeue`).",
+        )
 
     def _key(self, array: str, row: int, column: int, inner: int) -> str:
         size = self._settings.lightmap.tile
@@ -136,6 +161,11 @@ class TexelMapReader:
         if len(data) != side * side:
             raise InputError("the texel map ends early", where=self._sha256)
         return b"".join(data[row * side : (row + 1) * side : stride] for row in range(0, side, stride))
+
+    async def has_surface(self, row: int, column: int) -> bool:
+        """Whether a texel has a surface point: it is rendered with its tile."""
+        at = self._starts["state"] + row * self._resolution + column
+        return await _bytes(self._blobs, self._sha256, at, at + 1) not in (b"", b"\0")
 
     async def normal(self, row: int, column: int) -> tuple[float, ...]:
         """The geometric normal at a texel."""

@@ -6,6 +6,12 @@ SELECT (spec -> 'tile' ->> 'row')::int AS row, (spec -> 'tile' ->> 'column')::in
        (spec -> 'tile' ->> 'size')::int AS size, state
 FROM tasks WHERE job_id = %(job_id)s AND kind = 'render' ORDER BY ordinal;
 
+-- name: rendered_tiles
+-- Those of some tiles of a job that are rendered.
+SELECT asked."row", asked."column" FROM unnest(%(rows)s::int[], %(columns)s::int[]) AS asked ("row", "column")
+JOIN tasks ON tasks.job_id = %(job_id)s AND tasks.kind = 'render' AND tasks.state = 'completed'
+  AND tasks.label = format('tile %%s,%%s', asked."row", asked."column");
+
 -- name: tile_task
 -- The render task of a tile.
 SELECT id FROM tasks

@@ -5,6 +5,7 @@ import json
 import shutil
 import struct
 from pathlib import Path
+from urllib.parse import urlparse
 
 import numpy as np
 import pytest
@@ -104,7 +105,7 @@ def test_a_damaged_shard_is_a_sentence(home, job, rendered):
         shard.seek(-(16 * 64 + 4), 2)
         shard.write((0).to_bytes(8, "little") + (2**40).to_bytes(8, "little"))
     told = home.client.get(f"/jobs/{job}/texels/0/0").raise_for_status().json()
-    assert "the texel has 1099511627776 bytes" in told["missing"]["image"]
+    assert "its checksum is wrong" in told["missing"]["image"]
 
 
 def test_a_texel_map_of_something_else_is_a_sentence(home, job, rendered):
@@ -139,3 +140,23 @@ def test_an_unknown_job_has_no_pages(shared):
     for path in ("", "/atlas", "/texels", "/irradiance?tile=0,0", "/texels/0/0", "/tiles/0/0"):
         reply = shared.client.get(f"/jobs/nobody{path}", headers={"Accept": "text/html"})
         assert reply.status_code == 404 and "<h1>Not found</h1>" in reply.text
+
+
+def test_damage_of_the_store_is_told_and_never_drawn_as_black(home, job, rendered):
+    """A wrong byte, a cut object and a lost one of a rendered tile: of its irradiance, and of a texel's light field."""
+    root = Path(urlparse(rendered.store.url).path)
+    places = {"irradiance/c/0/1/0": f"/jobs/{job}/irradiance?tile=0,8", "light_field/c/0/1/0/0/0": None}
+    for name, url in places.items():
+        file = root / name
+        data = file.read_bytes()
+        for damaged in (data[:-9] + bytes([data[-9] ^ 1]) + data[-8:], data[: len(data) // 2], None):
+            file.unlink() if damaged is None else file.write_bytes(damaged)
+            if url is not None:
+                reply = home.client.get(url)
+                assert reply.status_code == 404 and name in reply.text
+            else:
+                told = home.client.get(f"/jobs/{job}/texels/0/8").raise_for_status().json()
+                assert "image" not in told and name in told["missing"]["image"]
+            file.write_bytes(data)
+    assert home.client.get(places["irradiance/c/0/1/0"]).status_code == 200
+    assert "image" in home.client.get(f"/jobs/{job}/texels/0/8").json()
