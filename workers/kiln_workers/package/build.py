@@ -38,6 +38,7 @@ from kiln_workers.package.gates import Judgement, write_gates
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.package.half import lobes_to_layers, to_half
 from kiln_workers.package.preview import PackagePreview
+from kiln_workers.package.seams import Stitcher
 from kiln_workers.scene.model import Scene
 
 Float32 = npt.NDArray[np.float32]
@@ -156,8 +157,10 @@ def build_package(folder: Path, given: PackageInput, judge: Judge | None = None)
     (folder / MANIFEST_JSON).unlink(missing_ok=True)
     valid = given.texel_map.state == TEXEL_VALID
     for function, lobe_map in given.lobes.items():
-        _write_lobes(package, function, lobe_map, plan_fill(lobe_map.mask, given.texel_map.chart))
-    irradiance = plan_fill(valid, given.texel_map.chart).smooth(given.irradiance)
+        fill = plan_fill(lobe_map.mask, given.texel_map.chart)
+        _write_lobes(package, function, lobe_map, fill, Stitcher(given.scene, fill))
+    fill = plan_fill(valid, given.texel_map.chart)
+    irradiance = np.maximum(Stitcher(given.scene, fill).stitch(fill.smooth(given.irradiance)), 0.0)
     _write_irradiance(package, irradiance)
     _write_errors(package)
     if given.environment is not None:
@@ -200,8 +203,10 @@ def _check(given: PackageInput) -> None:
         raise InternalError("irradiance that is not finite", where="package")
 
 
-def _write_lobes(package: _Package, function: Function, lobe_map: LobeMap, fill: Fill) -> None:
-    layers, clamped = lobes_to_layers(fill.nearest(lobe_map.lobes))
+def _write_lobes(package: _Package, function: Function, lobe_map: LobeMap, fill: Fill, stitcher: Stitcher) -> None:
+    stitched = stitcher.stitch(fill.nearest(lobe_map.lobes))
+    stitched[..., 3:] = np.maximum(stitched[..., 3:], 0.0)  # an extrapolated sharpness or amplitude
+    layers, clamped = lobes_to_layers(stitched)
     package.clamped += clamped
     count = lobe_map.lobes.shape[2]
     metadata = {
