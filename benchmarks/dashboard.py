@@ -155,11 +155,11 @@ def main() -> None:
                 "jobs, completed": "/jobs?state=completed",
                 "workers": "/workers",
                 f"job of {arguments.tiles} tiles": f"/jobs/{big}",
-                f"its {arguments.tiles} tiles": f"/jobs/{big}/atlas",
+                f"its {arguments.tiles} tiles": f"/v1/jobs/{big}/tiles",
             }
             rows = measure(url, token, paths, arguments.repeats)
             if arguments.browser:
-                shown = {name: path for name, path in paths.items() if not path.endswith("/atlas")}
+                shown = {name: path for name, path in paths.items() if not path.endswith("/tiles")}
                 rows += measure_browser(url, token, shown, min(arguments.repeats, 5))
         finally:
             coordinator.terminate()

@@ -9,6 +9,7 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from io import BufferedReader
 from pathlib import Path
@@ -58,7 +59,7 @@ from kiln_schemas.operators import (
 )
 from kiln_schemas.options import check_key
 from kiln_schemas.proxies import is_loopback
-from kiln_schemas.states import JobState
+from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
 
 CHUNK: Final = 1 << 20
@@ -68,6 +69,22 @@ AWAY: Final = frozenset({TooMany.status, 502, 503, 504})
 MISSING_AT_ONCE: Final = 4096
 OnBytes = Callable[[int], None]
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class TileMap:
+    """Tiles of a light map, row by row."""
+
+    side: int
+    """Tiles along each side."""
+    cells: bytes
+    """[side * side] 0 where there is no tile, else 1 plus the place of its state in `TaskState`."""
+    etag: str = ""
+
+    def states(self) -> Iterator[TaskState | None]:
+        """The state of each cell; None where there is no tile."""
+        states = (None, *TaskState)
+        return (states[code] for code in self.cells)
 
 
 class Client:
@@ -154,10 +171,23 @@ class Client:
         return self._parsed(JobPage, self._call("GET", "/v1/jobs", params=params))
 
     def tasks(self, job_id: str, kind: TaskKind | None = None) -> tuple[TaskView, ...]:
-        """A job's tasks, all or of one kind."""
-        params = {} if kind is None else {"kind": kind.value}
-        reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/tasks", params=params)
-        return self._parsed(tuple[TaskView, ...], reply)
+        """A job's tasks, all or of one kind, page by page."""
+        params: dict[str, Any] = {} if kind is None else {"kind": kind.value}
+        tasks: list[TaskView] = []
+        while True:
+            reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/tasks", params=params)
+            tasks += self._parsed(tuple[TaskView, ...], reply)
+            if (following := reply.headers.get("X-Next-Cursor")) is None:
+                return tuple(tasks)
+            params["cursor"] = following
+
+    def tiles(self, job_id: str, known: TileMap | None = None) -> TileMap:
+        """The states of a job's tiles; `known` itself where nothing has changed."""
+        headers = {} if known is None else {"If-None-Match": known.etag}
+        reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/tiles", headers=headers)
+        if known is not None and reply.status_code == 304:
+            return known
+        return TileMap(int(reply.headers["X-Side"]), reply.content, reply.headers["ETag"])
 
     def curves(self, job_id: str) -> tuple[CurveView, ...]:
         """The losses of a job's fits over their steps."""
@@ -328,7 +358,7 @@ class Client:
             except (httpx.TransportError, httpx.DecodingError) as error:
                 reason = str(error) or type(error).__name__
             else:
-                if response.is_success:
+                if response.is_success or response.status_code == 304:
                     return response
                 if response.status_code not in AWAY:
                     raise self._error(response)

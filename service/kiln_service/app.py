@@ -34,6 +34,8 @@ from kiln_service.events import Signals
 from kiln_service.maintenance import Maintenance
 from kiln_service.metrics import RequestSeconds
 from kiln_service.rates import RateLimits
+from kiln_service.streams import Streams
+from kiln_service.tile_maps import TileMaps
 from kiln_service.webhooks import Deliverer
 from kiln_service.work import Work
 
@@ -103,9 +105,11 @@ async def _lifespan(app: FastAPI, config: ServiceConfig, tokens: TokenBook) -> A
         signals = Signals(database)
         blobs = Blobs(database, config, functools.partial(make_again, database))
         work = Work(database, config, signals)
-        app.state.parts = Parts(config, database, blobs, signals, work, tokens)
+        streams = Streams(database, signals, config.timing.poll_s, config.limits.streams)
+        app.state.parts = Parts(config, database, blobs, signals, streams, TileMaps(database), work, tokens)
         background = [
             asyncio.create_task(signals.listen(), name="signals"),
+            asyncio.create_task(streams.read(), name="streams"),
             asyncio.create_task(Deliverer(database, config.timing).run(), name="webhooks"),
             asyncio.create_task(Maintenance(database, config, work, blobs).run(), name="maintenance"),
         ]

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from psycopg import OperationalError
 from psycopg.rows import DictRow
 
 from kiln_schemas.errors import AuthError, Forbidden, InputError
@@ -130,21 +129,21 @@ class Lookups:
         waiting = self._waiting[query]
         answer = waiting.setdefault(digest, asyncio.get_running_loop().create_future())
         async with self._turns[query]:
-            if not answer.done():
+            if self._waiting[query].get(digest) is answer:  # else an earlier turn has taken it along
                 batch, self._waiting[query] = self._waiting[query], {}
-                await self._answer(query, batch, database)
-        return answer.result()
+                answering = asyncio.create_task(self._answer(query, batch, database), name="look-up")
+                await asyncio.shield(answering)  # others wait for it too, should this request be given up
+        return await asyncio.shield(answer)
 
     async def _answer(self, query: str, batch: dict[str, asyncio.Future[DictRow | None]], database: Database) -> None:
         try:
             async with database.transaction() as tx:
                 rows = {row["sha256"]: row for row in await tx.all(query, hashes=list(batch))}
-        except BaseException as error:  # whoever waits gets the same answer, also where this request was given up
-            failure = error if isinstance(error, Exception) else OperationalError("the look-up was given up")
+        except Exception as error:
             for future in batch.values():
-                future.set_exception(failure)
+                future.set_exception(error)
                 future.exception()  # some of those who asked may have left
-            raise
+            return
         for digest, future in batch.items():
             future.set_result(rows.get(digest))
 

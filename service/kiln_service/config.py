@@ -80,6 +80,19 @@ class ConnectionLimits(Contract):
     bytes_per_s: float = Field(default=512.0, ge=0, le=1e9)
 
 
+class LogLimits(Contract):
+    """How much of what tasks print is kept (`kiln_service.task_logs`); the oldest goes first."""
+
+    attempt_bytes: Bound = 4 * 2**20
+    """Of one attempt,"""
+    job_bytes: Bound = 64 * 2**20
+    """of all attempts of a job,"""
+    all_bytes: Bound = 2**30
+    """and of all jobs."""
+    answer_bytes: Bound = 2**20
+    """That one request reads, about."""
+
+
 class Limits(Contract):
     """Bounds that keep one client from exhausting the coordinator."""
 
@@ -102,6 +115,9 @@ class Limits(Contract):
     rates: Rates = Rates()
     """How often one caller may ask."""
     connections: ConnectionLimits = ConnectionLimits()
+    logs: LogLimits = LogLimits()
+    streams: int = Field(default=128, ge=1, lt=2**31)
+    """Event streams and followed logs that one token may have open."""
 
 
 class Timing(Contract):

@@ -1,14 +1,13 @@
-"""The append-only history of every job, and the streams that follow it.
+"""The append-only history of every job, and the signals that wake who waits for more of it (`kiln_service.streams`).
 
-One connection per coordinator LISTENs for all; waiting claims and event streams sleep on an in-process signal and wake
-at the latest after `poll_s`, so a lost notification costs a second and nothing else.
+One connection per coordinator LISTENs for all; waiting claims and the reader of events sleep on an in-process signal
+and wake at the latest after `poll_s`, so a lost notification costs a second and nothing else.
 """
 
 import asyncio
 import contextlib
 import logging
-import time
-from collections.abc import AsyncIterator, Collection, Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, Final
 
 import psycopg
@@ -25,13 +24,13 @@ log = logging.getLogger(__name__)
 
 QUEUED_CHANNEL: Final = "kiln_queued"
 EVENT_CHANNEL: Final = "kiln_event"
+ANY_JOB: Final = "any job"
+"""What the reader of events waits for."""
 CLAIMS_WOKEN: Final = 8
 """Of the claims that wait, so many look for a task when one was queued, and one more for each that found one: were all
 woken, a thousand idle workers would ask the database a thousand times for every task."""
 BATCH: Final = 500
 """Events read at a time."""
-KEEPALIVE_S: Final = 15.0
-"""An idle stream sends a comment this often, so that proxies and dead clients are noticed."""
 
 
 async def add_event(
@@ -44,10 +43,12 @@ async def add_event(
 
 async def read_events(database: Database, job_id: str, after: int, limit: int = BATCH) -> list[EventView]:
     """Events of a job with ids greater than `after`, oldest first."""
-    return (await _read(database, job_id, after, limit))[1]
+    return (await read_state_and_events(database, job_id, after, limit))[1]
 
 
-async def _read(database: Database, job_id: str, after: int, limit: int) -> tuple[JobState, list[EventView]]:
+async def read_state_and_events(
+    database: Database, job_id: str, after: int, limit: int
+) -> tuple[JobState, list[EventView]]:
     """The job's state, read before the events: if it is final, its last event is among them or was read earlier."""
     async with database.transaction() as tx:
         job = await tx.maybe("job_state", id=job_id)
@@ -59,36 +60,15 @@ async def _read(database: Database, job_id: str, after: int, limit: int) -> tupl
 
 async def is_over(database: Database, job_id: str, after: int) -> bool:
     """Whether nothing will come after the event `after`: a stream that resumes there need not begin."""
-    state, events = await _read(database, job_id, after, 1)
+    state, events = await read_state_and_events(database, job_id, after, 1)
     return state in FINAL_JOB_STATES and not events
-
-
-async def stream_events(
-    database: Database, signals: "Signals", job_id: str, after: int, poll_s: float
-) -> AsyncIterator[str]:
-    """Server-sent events (WHATWG HTML, 9.2) of a job, past and coming, until the job is over."""
-    quiet = time.monotonic()
-    with signals.watch(EVENT_CHANNEL) as woken:
-        while not signals.stopping:
-            woken.clear()
-            state, events = await _read(database, job_id, after, BATCH)
-            for event in events:
-                yield f"id: {event.id}\nevent: {event.kind}\ndata: {event.model_dump_json()}\n\n"
-                after, quiet = event.id, time.monotonic()
-            if len(events) == BATCH:
-                continue
-            if state in FINAL_JOB_STATES:
-                return
-            if time.monotonic() - quiet > KEEPALIVE_S:
-                yield ": still here\n\n"
-                quiet = time.monotonic()
-            await wait(woken, poll_s)
 
 
 async def wait(woken: asyncio.Event, at_most_s: float) -> None:
     """Sleep until woken, or for so long."""
     with contextlib.suppress(TimeoutError):
-        await asyncio.wait_for(woken.wait(), at_most_s)
+        async with asyncio.timeout(at_most_s):  # wait_for of Python 3.11 may swallow a cancellation
+            await woken.wait()
 
 
 class Signals:
@@ -117,7 +97,7 @@ class Signals:
             if notification.channel == QUEUED_CHANNEL:
                 self.wake(QUEUED_CHANNEL, CLAIMS_WOKEN, notification.payload.split(","))
             else:
-                self.wake(notification.channel)
+                self.wake(EVENT_CHANNEL, about=[ANY_JOB])
 
     def wake(self, channel: str, at_most: int | None = None, about: Collection[str] = ()) -> None:
         """Wake who sleeps on the channel, or `at_most` of them: those first that were not woken for longest.
@@ -142,7 +122,10 @@ class Signals:
 
     @contextlib.contextmanager
     def watch(self, channel: str, wanted: Collection[str] = ()) -> Iterator[asyncio.Event]:
-        """An event that `wake` sets, for the time of the block; for the queue, by kinds of tasks and ids."""
+        """An event that `wake` sets, for the time of the block; for the queue, by kinds of tasks and ids.
+
+        Without anything `wanted` it is set only by `wake` without `about`: when the coordinator stops.
+        """
         event = asyncio.Event()
         self._waiting[channel][event] = frozenset(wanted)
         try:

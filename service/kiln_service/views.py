@@ -1,6 +1,6 @@
 """Jobs and tasks as clients see them, with an honest estimate of the time left."""
 
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,15 +10,16 @@ from pydantic import ValidationError
 
 from kiln_schemas.errors import InputError, InternalError, NotFound
 from kiln_schemas.job import CurveView, JobPage, JobView, StageView, TaskView
-from kiln_schemas.states import FINAL_JOB_STATES, OVER_TASK_STATES, JobState, TaskState
+from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
 from kiln_service.db import Database, JobRow, TaskRow, Tx, job_rows, readable, readable_rows
 from kiln_service.db.lenient import note_unreadable
-from kiln_service.events import EVENT_CHANNEL, Signals, wait
 from kiln_service.planner import METHODS
 
 LEAST_FRACTION: Final = 0.05
 """A running task says nothing about its duration before this."""
+MOST_CHANGES: Final = 2000
+"""After more events than this all tasks count as changed."""
 CURVE_POINTS: Final = 1000
 """About the most points of the curve of a task that runs."""
 
@@ -61,14 +62,44 @@ async def job_page(
     return JobPage(jobs=tuple(views), next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
 
-async def task_views(
-    database: Database, job_id: str, kind: TaskKind | None, state: TaskState | None
-) -> tuple[TaskView, ...]:
-    """Tasks of a job in the order of planning."""
+@dataclass(frozen=True)
+class TaskPage:
+    """Some tasks of a job in the order of planning."""
+
+    tasks: tuple[TaskView, ...]
+    next: int | None
+    """Cursor of the next page."""
+    version: int
+    """The id of an event: what is `since` it has changed after this page was read."""
+
+
+async def task_page(
+    database: Database,
+    job_id: str,
+    *,
+    kind: TaskKind | None,
+    state: TaskState | None,
+    since: int | None,
+    cursor: int | None,
+    limit: int,
+) -> TaskPage:
+    """Tasks of a kind and in a state after a cursor; with `since`, those alone that may have changed after an event."""
+    about = {"job_id": job_id, "kind": kind, "state": state, "cursor": -1 if cursor is None else cursor}
     async with database.transaction() as tx:
-        await _require_job(tx, job_id)
-        rows = await tx.all("list_tasks", job_id=job_id, kind=kind, state=state)
-    return tuple(task_view(TaskRow.of(row), row["worker"]) for row in rows)
+        version = await tx.maybe("tile_map_version", job_id=job_id)
+        if version is None:
+            raise NotFound(f"no job '{job_id}'", where="job")
+        if since is not None:
+            changes = await tx.one("changes_since", job_id=job_id, since=since, most=MOST_CHANGES + 1)
+            if changes["of_many"] or changes["changes"] > MOST_CHANGES:
+                since = None
+        if since is None:
+            rows = await tx.all("page_of_tasks", **about, limit=limit + 1)
+        else:
+            rows = await tx.all("page_of_changed_tasks", **about, since=since, limit=limit + 1)
+    following = rows[limit - 1]["ordinal"] if len(rows) > limit else None
+    tasks = tuple(TaskView.model_validate({k: v for k, v in row.items() if k != "ordinal"}) for row in rows[:limit])
+    return TaskPage(tasks, following, version["version"])
 
 
 async def curves(database: Database, job_id: str) -> tuple[CurveView, ...]:
@@ -77,56 +108,6 @@ async def curves(database: Database, job_id: str) -> tuple[CurveView, ...]:
         await _require_job(tx, job_id)
         rows = await tx.all("list_curves", job_id=job_id, points=CURVE_POINTS)
     return tuple(readable_rows(CurveView, rows))
-
-
-async def task_log(database: Database, task_id: str, tail: int | None = None) -> str:
-    """All that the attempts of a task wrote, each under a line that names it; or the last `tail` lines of that."""
-    return await _log_so_far(database, task_id, LogPlace(), tail)
-
-
-async def follow_log(
-    database: Database, signals: Signals, task_id: str, tail: int | None, poll_s: float
-) -> AsyncIterator[str]:
-    """The same, and what is written from now on until the task is over."""
-    place, over = LogPlace(), False
-    yield await _log_so_far(database, task_id, place, tail)
-    with signals.watch(EVENT_CHANNEL) as woken:
-        while not over and not signals.stopping:
-            woken.clear()
-            async with database.transaction() as tx:
-                row = await tx.one("find_task", id=task_id)
-            over = TaskState(row["state"]) in OVER_TASK_STATES
-            async for piece in _log_pieces(database, task_id, place):
-                yield piece
-            if not over:
-                await wait(woken, poll_s)
-
-
-@dataclass
-class LogPlace:
-    """How far a log was read."""
-
-    row: int = 0
-    attempt: int | None = None
-
-
-async def _log_so_far(database: Database, task_id: str, place: LogPlace, tail: int | None) -> str:
-    """What there is after `place`, or the last `tail` lines of it."""
-    text = "".join([piece async for piece in _log_pieces(database, task_id, place)])
-    lines = text.splitlines(keepends=True)
-    return text if tail is None else "".join(lines[max(0, len(lines) - tail) :])
-
-
-async def _log_pieces(database: Database, task_id: str, place: LogPlace) -> AsyncIterator[str]:
-    async with database.transaction() as tx:
-        if await tx.maybe("find_task", id=task_id) is None:
-            raise NotFound(f"no task '{task_id}'", where="task")
-        rows = await tx.all("task_log", task_id=task_id, after=place.row)
-    for row in rows:
-        if row["attempt"] != place.attempt:
-            yield f"--- attempt {row['attempt']}\n"
-        place.row, place.attempt = row["id"], row["attempt"]
-        yield row["lines"] if row["lines"].endswith("\n") else row["lines"] + "\n"
 
 
 async def artifacts(database: Database, job_id: str) -> tuple[Artifact, ...]:

@@ -49,9 +49,10 @@ from kiln_service.events import QUEUED_CHANNEL, Signals, add_event, wait
 from kiln_service.ids import new_id
 from kiln_service.jobs import settle_cancel
 from kiln_service.operators import OFFLINE_S
-from kiln_service.payloads import build_payload
+from kiln_service.payloads import Handed, build_payload
 from kiln_service.planner import METHODS, plan_after_prepare
 from kiln_service.reuse import check_sources, renders_to_reuse
+from kiln_service.task_logs import LogBounds
 
 RELEASED_CODE: Final = "canceled"
 """A worker that leaves in good order gives its task back with this code; that is no strike against the task."""
@@ -63,6 +64,7 @@ class Work:
     def __init__(self, database: Database, config: ServiceConfig, signals: Signals) -> None:
         self._database, self._config, self._signals = database, config, signals
         self._disk = Disk(config)
+        self._logs = LogBounds(database, config.limits.logs)
         self._claims = Batches(database, self._claim_all)
         self._renders = Batches(database, self._commit_renders)
 
@@ -105,7 +107,7 @@ class Work:
 
     async def claim(
         self, worker_id: str, request: ClaimRequest, owner: str, is_gone: Callable[[], Awaitable[bool]]
-    ) -> Claim | None:
+    ) -> Handed | None:
         """The next task of these kinds, waiting for one as long as the worker allows; None where there is none.
 
         `is_gone` tells whether the worker hung up: a task given to nobody would wait for the reaper.
@@ -118,9 +120,9 @@ class Work:
                     self._signals.wake(QUEUED_CHANNEL, 1, request.kinds)
                     return None
                 found = await self._claim_once(worker_id, request.kinds, owner)
-                if isinstance(found, Claim):
+                if isinstance(found, Handed):
                     # There may be more: the next one that waits looks.
-                    self._signals.wake(QUEUED_CHANNEL, 1, [found.payload.kind])
+                    self._signals.wake(QUEUED_CHANNEL, 1, [found.claim.payload.kind])
                     return found
                 left = deadline - time.monotonic()
                 if left <= 0 or self._signals.stopping:
@@ -128,7 +130,7 @@ class Work:
                 if found is _NOTHING:
                     await wait(woken, min(left, self._signals.claim_poll_s(self._config.timing.poll_s)))
 
-    async def _claim_once(self, worker_id: str, kinds: Sequence[TaskKind], owner: str) -> "Claim | _Outcome":
+    async def _claim_once(self, worker_id: str, kinds: Sequence[TaskKind], owner: str) -> "Handed | _Outcome":
         stale_s = self._config.timing.stale_s
         async with self._database.transaction() as tx:
             worker = await _find_worker(tx, worker_id, owner)
@@ -143,27 +145,27 @@ class Work:
 
     async def _claim_all(
         self, tx: Tx, job_id: str, askers: Sequence[tuple[WorkerRow, Sequence[TaskKind]]]
-    ) -> list[Claim | Exception | None]:
+    ) -> list[Handed | Exception | None]:
         """A task of the job for each worker; None where others have claimed what it saw."""
         leases = [secrets.token_urlsafe(32) for _ in askers]
         hashes = [digest_of(lease) for lease in leases]
         job, tasks = await transitions.claim_next(tx, job_id, askers, hashes, self._config.timing.stale_s)
-        claims: list[Claim | Exception | None] = []
+        claims: list[Handed | Exception | None] = []
         for (worker, _), task, lease in zip(askers, tasks, leases, strict=True):
             if task is None:
                 claims.append(None)
                 continue
             await tx.run("see_worker", id=worker.id)
-            claims.append(
-                Claim(
-                    task_id=task.id,
-                    job_id=job.id,
-                    attempt=task.attempt,
-                    lease=lease,
-                    payload=await build_payload(tx, job, task),
-                    checkpoint=task.checkpoint,
-                )
+            built = await build_payload(tx, job, task)
+            claim = Claim(
+                task_id=task.id,
+                job_id=job.id,
+                attempt=task.attempt,
+                lease=lease,
+                payload=built.payload,
+                checkpoint=task.checkpoint,
             )
+            claims.append(Handed(claim, built.lists))
         return claims
 
     async def heartbeat(self, worker_id: str, beat: Heartbeat, owner: str) -> HeartbeatReply:
@@ -183,6 +185,7 @@ class Work:
         )
         if row is None or not row["known"]:
             raise _no_worker(worker_id)
+        self._logs.taken(beat.log)
         if row["job_state"] is None:
             return HeartbeatReply(stop=True, reason="the task was given to another attempt or is over")
         state = JobState(row["job_state"])
@@ -297,7 +300,9 @@ class Work:
         lost = await lost_renders.believed(self._database, self._config, task_id, failure)
         async with locked_task(self._database, task_id) as (tx, job, task):
             _check_fence(task, failure)
-            await _add_log(tx, task.id, failure.attempt, failure.log if self._disk.shortage() is None else "")
+            lines = failure.log if self._disk.shortage() is None else ""
+            await _add_log(tx, task.id, failure.attempt, lines)
+            self._logs.taken(lines)
             if lost is not None and job.state in LIVE_JOB_STATES and task.strikes + 1 < self._config.max_attempts:
                 actor, reason = f"worker:{task.worker_id}", failure.problem.sentence()
                 await transitions.requeue_task(tx, task, "task.retried", actor, strike=True, reason=reason)

@@ -1,11 +1,10 @@
 """The light map and the losses as a terminal shows them."""
 
-from datetime import UTC, datetime
-
 import pytest
 from rich.console import Console
 
-from kiln_schemas.job import CurveView, TaskView
+from kiln_schemas.client import TileMap
+from kiln_schemas.job import CurveView
 from kiln_schemas.states import TaskState
 from kiln_schemas.tasks import TaskKind
 from kiln_service.cli.tile_map import BARS, COLOURS, draw_grid, legend, sparkline, tile_grid
@@ -13,19 +12,12 @@ from kiln_service.cli.tile_map import BARS, COLOURS, draw_grid, legend, sparklin
 S = TaskState
 
 
-def tile(row: int, column: int, state: TaskState) -> TaskView:
-    return TaskView(
-        id=f"{row},{column}",
-        kind=TaskKind.RENDER,
-        label=f"tile {row},{column}",
-        state=state,
-        attempt=1,
-        worker=None,
-        progress=None,
-        created=datetime.now(UTC),
-        started=None,
-        finished=None,
-    )
+def tiles(side: int, states: dict[tuple[int, int], TaskState]) -> TileMap:
+    """A map of tiles by row and column."""
+    cells = bytearray(side * side)
+    for (row, column), state in states.items():
+        cells[row * side + column] = 1 + list(TaskState).index(state)
+    return TileMap(side, bytes(cells))
 
 
 def curve(points, steps=None) -> CurveView:
@@ -33,21 +25,20 @@ def curve(points, steps=None) -> CurveView:
 
 
 def test_a_tile_is_a_cell_at_its_place() -> None:
-    tiles = [tile(0, 0, S.COMPLETED), tile(0, 16, S.ACTIVE), tile(16, 0, S.FAILED)]
-    assert tile_grid(tiles, 32, 16, 64) == [[S.COMPLETED, S.ACTIVE], [S.FAILED, None]]
+    found = tiles(2, {(0, 0): S.COMPLETED, (0, 1): S.ACTIVE, (1, 0): S.FAILED})
+    assert tile_grid(found, 64) == [[S.COMPLETED, S.ACTIVE], [S.FAILED, None]]
 
 
 def test_the_worst_state_wins_where_tiles_share_a_cell() -> None:
-    states = {(0, 0): S.COMPLETED, (0, 8): S.WAITING, (8, 0): S.SOFT_FAILED, (8, 8): S.ACTIVE, (24, 24): S.COMPLETED}
-    tiles = [tile(row, column, state) for (row, column), state in states.items()]
-    assert tile_grid(tiles, 32, 8, 2) == [[S.SOFT_FAILED, None], [None, S.COMPLETED]]
+    states = {(0, 0): S.COMPLETED, (0, 1): S.WAITING, (1, 0): S.SOFT_FAILED, (1, 1): S.ACTIVE, (3, 3): S.COMPLETED}
+    assert tile_grid(tiles(4, states), 2) == [[S.SOFT_FAILED, None], [None, S.COMPLETED]]
     assert set(COLOURS) == set(TaskState)
 
 
 @pytest.mark.parametrize("side", [1, 2, 5])
 def test_two_rows_are_a_line(side: int) -> None:
-    tiles = [tile(4 * row, 4 * column, S.QUEUED) for row in range(side) for column in range(side)]
-    drawn = draw_grid(tile_grid(tiles, 4 * side, 4, 64))
+    everywhere = {(row, column): S.QUEUED for row in range(side) for column in range(side)}
+    drawn = draw_grid(tile_grid(tiles(side, everywhere), 64))
     lines = drawn.plain.splitlines()
     assert len(lines) == (side + 1) // 2 and {len(line) for line in lines} == {side}
     last = str(drawn.spans[-1].style)

@@ -17,6 +17,8 @@ from kiln_service.blobs import Blobs
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database
 from kiln_service.events import Signals
+from kiln_service.streams import Streams
+from kiln_service.tile_maps import TileMaps
 from kiln_service.work import Work
 
 
@@ -28,6 +30,8 @@ class Parts:
     database: Database
     blobs: Blobs
     signals: Signals
+    streams: Streams
+    tile_maps: TileMaps
     work: Work
     tokens: TokenBook
 

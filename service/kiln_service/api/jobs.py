@@ -1,9 +1,11 @@
 """Routes of jobs, their tasks, events and artifacts."""
 
+from collections.abc import AsyncIterator
 from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
+from pydantic import TypeAdapter
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.job import (
@@ -20,17 +22,16 @@ from kiln_schemas.job import (
 from kiln_schemas.operators import Scope
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
-from kiln_service import jobs, views
+from kiln_service import jobs, task_logs, views
 from kiln_service.api.common import Parts, PartsHere, caller, problems
 from kiln_service.api.files import serve_blob
 from kiln_service.auth import Principal
-from kiln_service.events import BATCH, is_over, read_events, stream_events
+from kiln_service.events import BATCH, is_over, read_events
+from kiln_service.streams import CountedStream
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
-UNBUFFERED: Final = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-"""Headers of a stream, so that no proxy holds it back."""
-
+Caller = Annotated[Principal, Depends(caller(Scope.READ))]
 Reader = Depends(caller(Scope.READ))
 Submitter = Annotated[Principal, Depends(caller(Scope.SUBMIT))]
 UNSEEN: Final[dict[int | str, dict[str, Any]]] = {204: {"description": "Done; the token may not look at jobs"}}
@@ -133,12 +134,48 @@ async def archive(job_id: str, parts: PartsHere, who: Submitter) -> JobView | Re
     return await _seen(parts, job_id, who)
 
 
-@router.get("/jobs/{job_id}/tasks", dependencies=[Reader], responses=problems(404, 422))
+_TASKS: Final = TypeAdapter(tuple[TaskView, ...])
+_TILES: Final = problems(404) | {
+    200: {"description": "The map; X-Side tiles along each side", "content": {"application/octet-stream": {}}},
+    304: {"description": "It is as the client has it (If-None-Match)"},
+}
+
+
+@router.get(
+    "/jobs/{job_id}/tasks",
+    dependencies=[Reader],
+    response_model=tuple[TaskView, ...],
+    responses=problems(404, 422),
+)
 async def tasks(
-    job_id: str, parts: PartsHere, kind: TaskKind | None = None, state: TaskState | None = None
-) -> tuple[TaskView, ...]:
-    """The job's tasks in the order of planning."""
-    return await views.task_views(parts.database, job_id, kind, state)
+    job_id: str,
+    parts: PartsHere,
+    kind: TaskKind | None = None,
+    state: TaskState | None = None,
+    since: Annotated[
+        int | None, Query(ge=0, lt=2**63, description="only what may have changed since X-Version of an answer")
+    ] = None,
+    cursor: Annotated[int | None, Query(ge=0, lt=2**31, description="X-Next-Cursor of the page before")] = None,
+    limit: Annotated[int, Query(ge=1, le=500)] = 500,
+) -> Response:
+    """A page of the job's tasks in the order of planning; X-Next-Cursor is there where another follows."""
+    page = await views.task_page(
+        parts.database, job_id, kind=kind, state=state, since=since, cursor=cursor, limit=limit
+    )
+    headers = {"X-Version": str(page.version)}
+    if page.next is not None:
+        headers["X-Next-Cursor"] = str(page.next)
+    return Response(_TASKS.dump_json(page.tasks), headers=headers, media_type="application/json")
+
+
+@router.get("/jobs/{job_id}/tiles", dependencies=[Reader], response_class=Response, responses=_TILES)
+async def tiles(job_id: str, parts: PartsHere, if_none_match: Annotated[str | None, Header()] = None) -> Response:
+    """A byte a tile, row by row: 0 no tile, else 1 plus the place of its state among the states of a task."""
+    found = await parts.tile_maps.read(job_id)
+    headers = {"ETag": f'"{found.version}"', "Cache-Control": "no-cache", "X-Side": str(found.side)}
+    if if_none_match == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    return Response(found.cells, headers=headers, media_type="application/octet-stream")
 
 
 @router.get("/jobs/{job_id}/curves", dependencies=[Reader], responses=problems(404))
@@ -149,7 +186,6 @@ async def curves(job_id: str, parts: PartsHere) -> tuple[CurveView, ...]:
 
 @router.get(
     "/tasks/{task_id}/log",
-    dependencies=[Reader],
     response_class=PlainTextResponse,
     response_model=None,
     responses=problems(404, 422),
@@ -157,20 +193,26 @@ async def curves(job_id: str, parts: PartsHere) -> tuple[CurveView, ...]:
 async def log(
     task_id: str,
     parts: PartsHere,
+    who: Caller,
     tail: Annotated[int | None, Query(ge=0, le=100_000, description="only so many of the last lines")] = None,
+    before: Annotated[
+        int | None, Query(ge=1, lt=2**63, description="only what comes before: X-Log-Before of the answer after it")
+    ] = None,
     follow: Annotated[bool, Query(description="stay, and send what is written until the task is over")] = False,
 ) -> Response:
-    """What the task's attempts wrote."""
+    """The end of what the task's attempts wrote; X-Log-Before is there where more comes before it."""
+    most = parts.config.limits.logs.answer_bytes
     if not follow:
-        return PlainTextResponse(await views.task_log(parts.database, task_id, tail))
+        part = await task_logs.read_log(parts.database, task_id, most, tail, before)
+        headers = {} if part.before is None else {"X-Log-Before": str(part.before)}
+        return PlainTextResponse(part.text, headers=headers)
     await views.require_task(parts.database, task_id)
-    stream = views.follow_log(parts.database, parts.signals, task_id, tail, parts.config.timing.poll_s)
-    return StreamingResponse(stream, media_type="text/plain; charset=utf-8", headers=UNBUFFERED)
+    stream = task_logs.follow_log(parts.database, parts.signals, task_id, most, tail, parts.config.timing.poll_s)
+    return CountedStream(parts.streams, who.name, stream, "text/plain; charset=utf-8")
 
 
 @router.get(
     "/jobs/{job_id}/events",
-    dependencies=[Reader],
     response_model=None,
     responses=problems(404, 422)
     | {
@@ -187,19 +229,21 @@ async def log(
 async def events(
     job_id: str,
     parts: PartsHere,
+    who: Caller,
     format: Literal["sse", "json"] = "sse",
     after: Annotated[int | None, Query(ge=0, lt=2**63, description="only events with greater ids")] = None,
     limit: Annotated[int, Query(ge=1, le=10_000, description="most events of a list")] = BATCH,
     last_event_id: Annotated[str | None, Header(description="where a stream that broke goes on")] = None,
-) -> Response | list[EventView]:
+) -> Response:
     """The job's history. A stream ends when the job is over and goes on after `Last-Event-ID`."""
     start = after if after is not None else _event_id(last_event_id)
     if format == "json":
-        return await read_events(parts.database, job_id, start, limit)
+        first = await read_events(parts.database, job_id, start, min(limit, BATCH))
+        return StreamingResponse(_event_list(parts, job_id, first, limit), media_type="application/json")
     if await is_over(parts.database, job_id, start):
         return Response(status_code=204)
-    stream = stream_events(parts.database, parts.signals, job_id, start, parts.config.timing.poll_s)
-    return StreamingResponse(stream, media_type="text/event-stream", headers=UNBUFFERED)
+    stream = parts.streams.stream(job_id, start)
+    return CountedStream(parts.streams, who.name, stream, "text/event-stream")
 
 
 @router.get("/jobs/{job_id}/artifacts", dependencies=[Reader], responses=problems(404))
@@ -233,6 +277,17 @@ async def _seen(parts: Parts, job_id: str, who: Principal) -> JobView | Response
     if not who.scopes & {Scope.READ, Scope.ADMIN}:
         return Response(status_code=204)
     return await views.job_view(parts.database, job_id)
+
+
+async def _event_list(parts: Parts, job_id: str, page: list[EventView], limit: int) -> AsyncIterator[str]:
+    """Events as a JSON array, page by page: ten thousand at once would hold up everybody else."""
+    separator = "["
+    while page:
+        yield separator + ",".join(event.model_dump_json() for event in page)
+        separator = ","
+        limit -= len(page)
+        page = await read_events(parts.database, job_id, page[-1].id, min(limit, BATCH)) if limit > 0 else []
+    yield "[]" if separator == "[" else "]"
 
 
 def _event_id(header: str | None) -> int:

@@ -40,12 +40,12 @@ async def register(registration: WorkerRegistration, parts: PartsHere, who: Work
     response_model=Claim,
     responses=problems(404, 409, 422) | {204: {"description": "Nothing to do within `wait_s`"}},
 )
-async def claim(
-    worker_id: str, request: ClaimRequest, parts: PartsHere, who: Worker, http: Request
-) -> Claim | Response:
+async def claim(worker_id: str, request: ClaimRequest, parts: PartsHere, who: Worker, http: Request) -> Response:
     """Take the next task; held open up to `wait_s` while there is none. 409 `drained`: leave."""
-    found = await parts.work.claim(worker_id, request, who.name, http.is_disconnected)
-    return found or Response(status_code=204)
+    handed = await parts.work.claim(worker_id, request, who.name, http.is_disconnected)
+    if handed is None:
+        return Response(status_code=204)
+    return Response(handed.json(), media_type="application/json")
 
 
 @router.post("/workers/{worker_id}/heartbeat", responses=problems(404, 422))

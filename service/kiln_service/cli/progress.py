@@ -14,9 +14,9 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from kiln_schemas.client import Client
+from kiln_schemas.client import Client, TileMap
 from kiln_schemas.errors import Unreachable
-from kiln_schemas.job import CurveView, JobView, StageView, TaskView
+from kiln_schemas.job import CurveView, JobView, StageView
 from kiln_schemas.states import FINAL_JOB_STATES, TaskState
 from kiln_schemas.tasks import TaskKind
 from kiln_service.cli.output import duration, notices
@@ -34,8 +34,8 @@ LINE_S: Final = 10.0
 class Pictures:
     """What a terminal shows of a job beside its stages."""
 
-    tiles: Sequence[TaskView] = ()
-    """Its render tasks, once there are some."""
+    tiles: TileMap | None = None
+    """Its tiles while they are rendered."""
     curves: Sequence[CurveView] = ()
     """The losses of its fits, once there are some."""
 
@@ -90,10 +90,9 @@ class BarDisplay:
 
     def _drawn(self, job: JobView, seen: Pictures) -> Iterator[Text]:
         size = self._live.console.size
-        if seen.tiles and any(tile.state is not TaskState.COMPLETED for tile in seen.tiles):
-            lightmap = job.settings.lightmap
+        if seen.tiles is not None:
             room = max(2 * (size.height - len(job.stages) - len(seen.curves) - 4), 2)
-            grid = tile_grid(seen.tiles, lightmap.resolution, lightmap.tile, min(size.width - 1, room, MOST_CELLS))
+            grid = tile_grid(seen.tiles, min(size.width - 1, room, MOST_CELLS))
             yield draw_grid(grid)
             yield legend(grid)
         for curve in seen.curves:
@@ -154,10 +153,10 @@ def look(api: Client, job: JobView, seen: Pictures, *, tiles: bool) -> Pictures:
     """What there is to see of a job now, asked for only where something happens."""
     stages = {stage.kind: stage for stage in job.stages}
     render, fit = stages.get(TaskKind.RENDER), stages.get(TaskKind.FIT)
-    if tiles and render is not None and (not seen.tiles or render.completed < render.total):
-        seen = replace(seen, tiles=api.tasks(job.id, TaskKind.RENDER))
-    elif render is not None and render.completed == render.total:
-        seen = replace(seen, tiles=())
+    if tiles and render is not None and render.completed < render.total:
+        seen = replace(seen, tiles=api.tiles(job.id, seen.tiles))
+    elif render is not None:
+        seen = replace(seen, tiles=None)
     if fit is not None and (fit.active or (fit.completed and not seen.curves)):
         seen = replace(seen, curves=api.curves(job.id))
     return seen

@@ -4,13 +4,13 @@ The same as on the dashboard in characters: two rows of tiles a line, as the upp
 """
 
 import math
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from rich.text import Text
 
-from kiln_schemas.job import CurveView, TaskView
+from kiln_schemas.client import TileMap
+from kiln_schemas.job import CurveView
 from kiln_schemas.states import TaskState
 
 COLOURS: Final[dict[TaskState, str]] = {
@@ -26,28 +26,26 @@ COLOURS: Final[dict[TaskState, str]] = {
 EMPTY: Final = "black"
 """Where the light map has no tile, for no surface lies there."""
 BARS: Final = "▁▂▃▄▅▆▇█"
-_PLACE: Final = re.compile(r"tile (\d+),(\d+)")
 
 Grid = list[list[TaskState | None]]
 
 
-def tile_grid(tiles: Iterable[TaskView], resolution: int, tile: int, most: int) -> Grid:
-    """States of render tasks by place, at most `most` columns and rows; None where no tile is.
+def tile_grid(tiles: TileMap, most: int) -> Grid:
+    """States of tiles by place, at most `most` columns and rows; None where no tile is.
 
     Where there are more tiles than that, one cell stands for several and shows what matters most among them.
     """
-    side = math.ceil(resolution / tile)
-    step = math.ceil(side / most)
-    cells = math.ceil(side / step)
+    step = math.ceil(tiles.side / most)
+    cells = math.ceil(tiles.side / step)
     grid: Grid = [[None] * cells for _ in range(cells)]
-    order = list(COLOURS)
-    for task in tiles:
-        if (match := _PLACE.fullmatch(task.label)) is None:
+    order = {state: place for place, state in enumerate(COLOURS)}
+    for number, state in enumerate(tiles.states()):
+        if state is None:
             continue
-        row, column = int(match[1]) // tile // step, int(match[2]) // tile // step
+        row, column = number // tiles.side // step, number % tiles.side // step
         before = grid[row][column]
-        if before is None or order.index(task.state) > order.index(before):
-            grid[row][column] = task.state
+        if before is None or order[state] > order[before]:
+            grid[row][column] = state
     return grid
 
 

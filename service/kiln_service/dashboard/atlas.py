@@ -1,4 +1,4 @@
-"""What a job's page draws: the tiles of the atlas, which texels there are, their irradiance, single light fields."""
+"""What a job's page draws: which texels there are, their irradiance, single light fields."""
 
 import base64
 from typing import Annotated, Any, Final
@@ -9,7 +9,6 @@ from fastapi.responses import JSONResponse, Response
 from kiln_schemas.conventions import LIGHT_FIELD_KTX2
 from kiln_schemas.errors import InputError, KilnError, NotFound
 from kiln_schemas.operators import Scope
-from kiln_schemas.states import TaskState
 from kiln_service import views
 from kiln_service.api.common import Parts, PartsHere, caller
 from kiln_service.dashboard.light_fields import LightFields, TexelMapReader
@@ -26,24 +25,6 @@ MOST_STATES: Final = 2048
 
 Coordinate = Annotated[int, Path(ge=0, lt=8192)]
 Stride = Annotated[int, Query(ge=1, le=64)]
-
-
-@router.get("/atlas")
-async def atlas(job_id: str, parts: PartsHere) -> Response:
-    """The tiles as [row, column, size, state], the state as an index into `states`."""
-    job = await _job(parts, job_id)
-    states = [state.value for state in TaskState]
-    async with parts.database.transaction() as tx:
-        rows = await tx.all("atlas_tiles", job_id=job_id)
-    return JSONResponse(
-        {
-            "resolution": job.settings.lightmap.resolution,
-            "tile": job.settings.lightmap.tile,
-            "states": states,
-            "tiles": [[row["row"], row["column"], row["size"], states.index(row["state"])] for row in rows],
-        },
-        headers={"Cache-Control": "no-store"},
-    )
 
 
 @router.get("/texels")

@@ -18,6 +18,8 @@ from kiln_service.auth import Principal
 from kiln_service.dashboard.jobs import stretch
 from kiln_service.dashboard.pages import Form, page, see
 from kiln_service.db import Database, TaskRow, readable_rows
+from kiln_service.task_logs import read_log
+from kiln_service.tile_maps import STATES
 
 router = APIRouter(include_in_schema=False)
 
@@ -77,6 +79,7 @@ async def job(request: Request, job_id: str, parts: PartsHere) -> Response:
         actions=_allowed(view),
         limits={"events": EVENTS, "tasks": TASKS},
         live=view.state not in FINAL_JOB_STATES,
+        states=STATES,
     )
 
 
@@ -110,7 +113,7 @@ async def task(request: Request, task_id: str, parts: PartsHere) -> Response:
         "task.html",
         task=view,
         job_id=row["job_id"],
-        log=await views.task_log(parts.database, task_id, LOG_LINES),
+        log=(await read_log(parts.database, task_id, parts.config.limits.logs.answer_bytes, LOG_LINES)).text,
         lines=LOG_LINES,
         over=view.state in OVER_TASK_STATES,
         may_redo=view.state in OVER_TASK_STATES

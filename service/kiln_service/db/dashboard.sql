@@ -1,11 +1,5 @@
 -- Queries of kiln_service.dashboard.
 
--- name: atlas_tiles
--- Render tasks of a job as squares of its light map.
-SELECT (spec -> 'tile' ->> 'row')::int AS row, (spec -> 'tile' ->> 'column')::int AS column,
-       (spec -> 'tile' ->> 'size')::int AS size, state
-FROM tasks WHERE job_id = %(job_id)s AND kind = 'render' ORDER BY ordinal;
-
 -- name: rendered_tiles
 -- Those of some tiles of a job that are rendered.
 SELECT asked."row", asked."column" FROM unnest(%(rows)s::int[], %(columns)s::int[]) AS asked ("row", "column")

@@ -123,10 +123,14 @@ ORDER BY id LIMIT 1000;
 
 -- name: drop_logs
 -- What tasks logged of jobs in one of the states that ended before `days` ago and have none of the labels.
-DELETE FROM task_logs USING tasks, jobs
-WHERE tasks.id = task_logs.task_id AND jobs.id = tasks.job_id
-  AND jobs.state = ANY(%(states)s) AND jobs.finished < now() - make_interval(secs => %(days)s * 86400.0)
-  AND NOT EXISTS (SELECT FROM jsonb_each_text(%(keep)s) AS kept WHERE jobs.labels ->> kept.key = kept.value);
+WITH gone AS (
+    DELETE FROM log_sizes USING jobs
+    WHERE jobs.id = log_sizes.job_id
+      AND jobs.state = ANY(%(states)s) AND jobs.finished < now() - make_interval(secs => %(days)s * 86400.0)
+      AND NOT EXISTS (SELECT FROM jsonb_each_text(%(keep)s) AS kept WHERE jobs.labels ->> kept.key = kept.value)
+    RETURNING task_id, attempt
+)
+DELETE FROM task_logs USING gone WHERE task_logs.task_id = gone.task_id AND task_logs.attempt = gone.attempt;
 
 -- name: stores_needed_by_others
 -- Which of these stores jobs read that are not freed; the job itself apart.

@@ -36,13 +36,24 @@ FROM tasks
 WHERE job_id = ANY(%(job_ids)s)
 GROUP BY job_id, kind;
 
--- name: list_tasks
--- Tasks of a job in the order of planning, of a kind and in a state where given.
-SELECT tasks.*, CASE WHEN worker_id IS NOT NULL THEN worker_name END AS worker
+-- name: page_of_tasks
+-- Tasks of a job in the order of planning after a cursor, of a kind and in a state where given.
+SELECT tasks.id, kind, label, state, attempt, CASE WHEN worker_id IS NOT NULL THEN worker_name END AS worker,
+       progress, created, started, finished, error, ordinal
 FROM tasks
-WHERE job_id = %(job_id)s
+WHERE job_id = %(job_id)s AND ordinal > %(cursor)s
   AND (%(kind)s::text IS NULL OR kind = %(kind)s) AND (%(state)s::text IS NULL OR state = %(state)s)
-ORDER BY ordinal;
+ORDER BY ordinal LIMIT %(limit)s;
+
+-- name: page_of_changed_tasks
+-- The same, only of those that events after one are about.
+SELECT tasks.id, kind, label, state, attempt, CASE WHEN worker_id IS NOT NULL THEN worker_name END AS worker,
+       progress, created, started, finished, error, ordinal
+FROM tasks
+WHERE job_id = %(job_id)s AND ordinal > %(cursor)s
+  AND tasks.id IN (SELECT task_id FROM events WHERE events.job_id = %(job_id)s AND events.id > %(since)s)
+  AND (%(kind)s::text IS NULL OR kind = %(kind)s) AND (%(state)s::text IS NULL OR state = %(state)s)
+ORDER BY ordinal LIMIT %(limit)s;
 
 -- name: find_task
 -- A task's state.
@@ -54,6 +65,17 @@ SELECT id, at, job_id, task_id, kind, actor, detail FROM events
 WHERE job_id = %(job_id)s AND id > %(after)s
 ORDER BY id
 LIMIT %(limit)s;
+
+-- name: read_streamed
+-- New events of jobs, each after its own last one, in the order of ids; a row without an event where there is none.
+SELECT streamed.job_id AS streamed, jobs.state, new.*
+FROM unnest(%(job_ids)s::text[], %(afters)s::bigint[]) AS streamed (job_id, after)
+JOIN jobs ON jobs.id = streamed.job_id
+LEFT JOIN LATERAL (
+    SELECT id, at, job_id, task_id, kind, actor, detail FROM events
+    WHERE events.job_id = streamed.job_id AND events.id > streamed.after ORDER BY id LIMIT %(limit)s
+) AS new ON true
+ORDER BY new.id;
 
 -- name: list_artifacts
 -- What a job published.
@@ -79,3 +101,32 @@ SELECT tasks.id AS task_id, tasks.kind, tasks.label, tasks.state,
            '[]'
        ) AS points
 FROM tasks WHERE job_id = %(job_id)s AND kind = 'fit' ORDER BY ordinal;
+
+-- name: tile_map_version
+-- How a job's light map is divided, and the job's newest event.
+SELECT (settings #>> '{lightmap,resolution}')::int AS resolution, (settings #>> '{lightmap,tile}')::int AS tile,
+       COALESCE((SELECT max(id) FROM events WHERE job_id = jobs.id), 0) AS version
+FROM jobs WHERE id = %(job_id)s;
+
+-- name: changes_since
+-- How many events there are after one, of `most` at most, and whether one of them may be about many tasks.
+SELECT count(*) AS changes, COALESCE(bool_or(task_id IS NULL), false) AS of_many FROM (
+    SELECT task_id FROM events WHERE job_id = %(job_id)s AND id > %(since)s ORDER BY id LIMIT %(most)s
+) AS newer;
+
+-- name: changed_tiles
+-- Tiles that events after one are about: their places, row by row, and their states by number.
+SELECT (spec #>> '{tile,row}')::int / %(tile)s * %(side)s + (spec #>> '{tile,column}')::int / %(tile)s AS cell,
+       array_position(%(states)s::text[], state) AS code
+FROM tasks
+WHERE id IN (SELECT task_id FROM events WHERE job_id = %(job_id)s AND id > %(since)s) AND kind = %(kind)s;
+
+-- name: all_tiles
+-- A byte a tile, row by row: the number of its state, 0 where there is none.
+SELECT string_agg(set_byte('\x00'::bytea, 0, COALESCE(code, 0)), ''::bytea ORDER BY cell) AS cells
+FROM generate_series(0, %(side)s::int * %(side)s::int - 1) AS places (cell)
+LEFT JOIN (
+    SELECT (spec #>> '{tile,row}')::int / %(tile)s * %(side)s + (spec #>> '{tile,column}')::int / %(tile)s AS cell,
+           array_position(%(states)s::text[], state) AS code
+    FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s
+) AS there USING (cell);

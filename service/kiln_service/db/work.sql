@@ -117,6 +117,16 @@ SELECT count(*) AS tasks FROM tasks WHERE job_id = %(job_id)s AND state = 'activ
 -- Results of a job's tasks of a kind, in the order of planning.
 SELECT result FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state = 'completed' ORDER BY ordinal;
 
+-- name: results_as_text
+-- The same as a JSON array.
+SELECT '[' || COALESCE(string_agg(result::text, ',' ORDER BY ordinal), '') || ']' AS results
+FROM tasks WHERE job_id = %(job_id)s AND kind = %(kind)s AND state = 'completed';
+
+-- name: tiles_as_text
+-- The tiles of a job as its prepare task has found them, as a JSON array.
+SELECT (result -> 'tiles')::text AS tiles FROM tasks
+WHERE job_id = %(job_id)s AND kind = 'prepare' AND state = 'completed';
+
 -- name: renders_near
 -- Results of a job's render tasks whose tiles have texels from `start` to before `stop` in rows and columns.
 SELECT result FROM tasks
@@ -226,14 +236,6 @@ DELETE FROM losses WHERE task_id = %(task_id)s;
 -- Lines that an attempt wrote; nothing where the task is unknown.
 INSERT INTO task_logs (task_id, attempt, lines)
 SELECT id, %(attempt)s, %(lines)s FROM tasks WHERE id = %(task_id)s;
-
--- name: task_log
--- Lines of a task after those read before, oldest first.
-SELECT id, attempt, lines FROM task_logs WHERE task_id = %(task_id)s AND id > %(after)s ORDER BY id;
-
--- name: last_log
--- The last pieces of a task's log, newest first.
-SELECT lines FROM task_logs WHERE task_id = %(task_id)s ORDER BY id DESC LIMIT 20;
 
 -- name: set_checkpoint
 -- Publish an attempt's checkpoint: progress was made, so earlier failures count no more.

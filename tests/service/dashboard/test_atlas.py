@@ -11,15 +11,18 @@ import numpy as np
 import pytest
 import zstandard
 
+from kiln_schemas.states import TaskState
 from kiln_workers.package import ktx2
 from kiln_workers.package.half import lobes_to_layers
 
 
 def test_tiles_are_told_with_their_states(home, job, rendered):
-    told = home.client.get(f"/jobs/{job}/atlas").json()
-    assert (told["resolution"], told["tile"]) == (32, 8)
-    states = [(row, column, size, told["states"][state]) for row, column, size, state in told["tiles"]]
-    assert states == [(0, 0, 8, "completed"), (0, 8, 8, "completed"), (0, 16, 8, "queued"), (0, 24, 8, "queued")]
+    told = home.client.get(f"/v1/jobs/{job}/tiles")
+    states = [list(TaskState)[code - 1].value if code else None for code in told.content]
+    assert told.headers["x-side"] == "4"
+    assert states == ["completed", "completed", "queued", "queued", *12 * [None]]
+    page = home.client.get(f"/jobs/{job}").text
+    assert 'data-resolution="32" data-tile="8" data-states="' + " ".join(TaskState) in page
 
 
 def test_texels_and_irradiance_are_thinned_by_a_stride(home, job, rendered):
@@ -137,7 +140,7 @@ def test_what_makes_no_sense_is_refused(home, job):
 
 
 def test_an_unknown_job_has_no_pages(shared):
-    for path in ("", "/atlas", "/texels", "/irradiance?tile=0,0", "/texels/0/0", "/tiles/0/0"):
+    for path in ("", "/texels", "/irradiance?tile=0,0", "/texels/0/0", "/tiles/0/0"):
         reply = shared.client.get(f"/jobs/nobody{path}", headers={"Accept": "text/html"})
         assert reply.status_code == 404 and "<h1>Not found</h1>" in reply.text
 

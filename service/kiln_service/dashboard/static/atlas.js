@@ -81,11 +81,15 @@ export class Atlas {
   }
 
   async update() {
-    const reply = await fetch(`/jobs/${this.job}/atlas`);
+    const reply = await fetch(`/v1/jobs/${this.job}/tiles`);
     if (!reply.ok) return;
-    const told = await reply.json();
-    if (!told.tiles.length) return;
-    Object.assign(this, { resolution: told.resolution, tile: told.tile, states: told.states, tiles: told.tiles });
+    const { resolution, tile, states } = this.canvas.dataset;
+    const side = Number(reply.headers.get("X-Side")), size = Number(tile), tiles = [];
+    new Uint8Array(await reply.arrayBuffer()).forEach((code, cell) => {
+      if (code) tiles.push([size * Math.floor(cell / side), size * (cell % side), size, code - 1]);
+    });
+    if (!tiles.length) return;
+    Object.assign(this, { resolution: Number(resolution), tile: size, states: states.split(" "), tiles });
     this.stride = 1;
     while (this.stride < this.tile && (this.resolution / this.stride > FINEST || this.tile % this.stride)) this.stride += 1;
     this.pauseMs = this.tiles.length > 4096 ? 6000 : 1000;
