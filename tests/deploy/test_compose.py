@@ -129,7 +129,7 @@ def test_the_s3_server_takes_its_key_and_no_other():
                 config = {"endpoint": endpoint, "region": environment.get("AWS_REGION", "us-east-1")}
                 key = {"access_key_id": environment["AWS_ACCESS_KEY_ID"], "secret_access_key": "a-secret"}
                 objects = from_url("s3://lightkiln/farm", config=config | key, client_options={"allow_http": True})
-                deadline = time.monotonic() + 30
+                deadline = time.monotonic() + 300
                 while True:  # the bucket is made a moment after the server is ready
                     try:
                         obstore.put(objects, "probe", b"1")

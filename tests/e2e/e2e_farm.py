@@ -138,7 +138,7 @@ class Farm:
     def end(self, name: str) -> None:
         """SIGTERM, and wait."""
         self.processes[name].terminate()
-        self.processes[name].wait(30)
+        self.processes[name].wait(600)
 
     def kill(self, name: str, *, children_only: bool = False) -> None:
         """kill -9 of a process, or of its children alone."""
@@ -189,7 +189,7 @@ class Farm:
             process.terminate()
         for process in self.processes.values():
             try:
-                process.wait(30)
+                process.wait(600)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

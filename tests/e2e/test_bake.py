@@ -74,7 +74,7 @@ def test_interrupted_bake_resumes_to_the_same_bytes(baked: Path, room_files: tup
     store = out / ".lightkiln" / "store"
     wait_until("the first tile is written", lambda: any(store.glob("*.zarr/light_field/c/*/*/*")) and log.exists())
     running.send_signal(signal.SIGINT)
-    _, messages = running.communicate(timeout=60)
+    _, messages = running.communicate(timeout=600)
     assert running.returncode == 130, messages
     assert "--resume" in messages and "Traceback" not in messages
     assert not (out / "manifest.json").exists()

@@ -19,7 +19,7 @@ def worker(farm: Farm, folder: Path):
         process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
         yield process
         process.terminate()
-        process.wait(30)
+        process.wait(600)
 
 
 def test_a_poisonous_tile_fails_alone(farm: Farm, room_files: tuple[Path, Path], worker) -> None:

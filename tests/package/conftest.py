@@ -53,7 +53,7 @@ class NodeTools:
         """Run the Khronos reference compiler (the package carries a Linux x86-64 binary)."""
         binary = self.folder / "node_modules/glslang-validator-prebuilt-predownloaded/bin/glslangValidator.linux"
         binary.chmod(0o755)
-        return subprocess.run([str(binary), *map(str, arguments)], capture_output=True, text=True, timeout=60)
+        return subprocess.run([str(binary), *map(str, arguments)], capture_output=True, text=True, timeout=600)
 
 
 @pytest.fixture(scope="session")
@@ -63,7 +63,7 @@ def node_tools(tmp_path_factory: pytest.TempPathFactory) -> NodeTools:
         if file.is_file():
             shutil.copy(file, folder)
     command = ["npm", "install", "--no-audit", "--no-fund", "--no-package-lock", "--ignore-scripts"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=180)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, f"npm could not install the readers that package.json pins:\n{done.stderr}"
     return NodeTools(folder)
 
@@ -72,7 +72,7 @@ def node_tools(tmp_path_factory: pytest.TempPathFactory) -> NodeTools:
 def native() -> Iterator[Callable[..., Any]]:
     """Call a function in a process of its own, where compilers and drivers can do no harm; what it returns."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        yield lambda function, *arguments: process.submit(function, *arguments).result(timeout=120)
+        yield lambda function, *arguments: process.submit(function, *arguments).result(timeout=600)
 
 
 @pytest.fixture

@@ -134,7 +134,7 @@ class FakeWorker:
         reply = self.home.client.post(f"/v1/workers/{self.id}/claim", json=body).raise_for_status()
         return None if reply.status_code == 204 else reply.json()
 
-    def must_claim(self, *kinds: str, wait_s: float = 5) -> dict[str, Any]:
+    def must_claim(self, *kinds: str, wait_s: float = 30) -> dict[str, Any]:
         claim = self.claim(*kinds, wait_s=wait_s)
         assert claim is not None, "no task came"
         return claim
@@ -236,7 +236,7 @@ def serving(config: ServiceConfig) -> Iterator[Coordinator]:
             url = f"http://127.0.0.1:{listening.getsockname()[1]}"
             token = (config.data / "token").read_text().strip()
             headers = {"Authorization": f"Bearer {token}"}
-            with httpx.Client(base_url=url, headers=headers, timeout=30) as client:
+            with httpx.Client(base_url=url, headers=headers, timeout=300) as client:
                 yield Coordinator(config, url, token, client, app, loop)
         finally:
             parts = getattr(app.state, "parts", None)

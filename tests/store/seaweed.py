@@ -80,7 +80,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def wait_until_ready(server: "subprocess.Popen[bytes]", log: Path) -> None:
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 600.0
     while time.monotonic() < deadline and server.poll() is None:
         if b"components are running and ready" in log.read_bytes():
             return

@@ -84,7 +84,7 @@ def axe(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Page], list[str]]
     folder = tmp_path_factory.mktemp("axe")
     shutil.copy(NODE / "package.json", folder)
     command = ["npm", "install", "--no-audit", "--no-fund", "--no-package-lock", "--ignore-scripts"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=180)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, f"npm could not install axe-core:\n{done.stderr}"
     source = (folder / "node_modules/axe-core/axe.min.js").read_text()
 
