@@ -187,7 +187,8 @@ class Client:
         reply = self._call("GET", f"/v1/jobs/{quote(job_id, safe='')}/tiles", headers=headers)
         if known is not None and reply.status_code == 304:
             return known
-        return TileMap(int(reply.headers["X-Side"]), reply.content, reply.headers["ETag"])
+        side = self._parsed_text(int, reply.headers.get("X-Side", ""), reply)
+        return TileMap(side, reply.content, reply.headers.get("ETag", ""))
 
     def curves(self, job_id: str) -> tuple[CurveView, ...]:
         """The losses of a job's fits over their steps."""
@@ -378,8 +379,12 @@ class Client:
 
     def _parsed(self, kind: type[T], response: httpx.Response) -> T:
         """The answer as what it should be; whoever else answers there, it is told and no defect."""
+        return self._parsed_text(kind, response.content, response)
+
+    def _parsed_text(self, kind: type[T], text: str | bytes, response: httpx.Response) -> T:
+        """The same of a part of the answer."""
         try:
-            return TypeAdapter(kind).validate_json(response.content)
+            return TypeAdapter(kind).validate_json(text)
         except ValidationError:
             raise Unreachable(
                 f"unexpected answer {response.status_code} to {response.request.method} {response.request.url.path}",
