@@ -57,7 +57,7 @@ def test_tags_bring_a_job_to_its_workers_and_its_log_is_followed(ask, lightkiln,
     [
         (["requeue", "0", "--rows", "8"], "'8' is not a range"),
         (["requeue", "0", "--rows", "8:8"], "'8:8' is not a range"),
-        (["requeue", "0", "--kind", "prepare"], "'prepare' tasks are not done again"),
+        (["requeue", "0", "--kind", "prepare"], "--kind 'prepare' is refused"),
         (["change", "0", "--tag", "no blanks"], "'no blanks' is refused as a tag"),
         (["workers", "schedule", "w"], "either a span or none"),
         (["workers", "schedule", "w", "--from", "8", "--to", "9:00"], "--from"),
