@@ -14,6 +14,7 @@ from psycopg.rows import DictRow
 from psycopg_pool import PoolTimeout
 
 from kiln_service.blobs import Blobs
+from kiln_service.clock import DatabaseClock
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, execute
 from kiln_service.reaper import forget_workers, reap
@@ -49,8 +50,9 @@ class Maintenance:
         while not await self._leads(connection):
             await asyncio.sleep(self._timing.maintenance_s)
         grace_over = time.monotonic() + self._timing.stale_s
+        clock = DatabaseClock(self._database)
         while True:
-            await self._pass(may_reap=time.monotonic() >= grace_over)
+            await self._pass(clock, may_reap=time.monotonic() >= grace_over)
             await asyncio.sleep(self._timing.maintenance_s)
             await execute(connection, "ping")
 
@@ -58,11 +60,12 @@ class Maintenance:
         row = await (await execute(connection, "try_leadership", lock=LEADER_LOCK)).fetchone()
         return row is not None and bool(row["leader"])
 
-    async def _pass(self, *, may_reap: bool) -> None:
+    async def _pass(self, clock: DatabaseClock, *, may_reap: bool) -> None:
         """One round of everything; a defect in one part is logged and does not end the others."""
         try:
+            await clock.keep()
             if may_reap:
-                await reap(self._database, self._work, self._timing.stale_s)
+                await reap(self._database, self._work, self._timing.stale_s, clock)
                 await forget_workers(self._database)
             if time.monotonic() >= self._next_collection:
                 self._next_collection = time.monotonic() + self._timing.blob_grace_s / 4

@@ -11,6 +11,7 @@ from typing import Final
 from kiln_schemas.errors import BakeFailed, Problem
 from kiln_schemas.states import TaskState
 from kiln_service import transitions
+from kiln_service.clock import DatabaseClock
 from kiln_service.db import Database, TaskRow, Tx
 from kiln_service.operators import FORGOTTEN_S
 from kiln_service.work import Work, locked_task
@@ -21,10 +22,13 @@ LOG_LINES: Final = 8
 """Lines of a lost task's log that its error quotes."""
 
 
-async def reap(database: Database, work: Work, stale_s: float) -> int:
+async def reap(database: Database, work: Work, stale_s: float, clock: DatabaseClock) -> int:
     """End every attempt without a heartbeat for `stale_s`; how many."""
     async with database.transaction() as tx:
         rows = await tx.all("stale_tasks", seconds=stale_s)
+    if rows:
+        # The clock may have been set since it was looked at.
+        await clock.keep()
     return sum([await _reap_one(database, work, row["id"], stale_s) for row in rows])
 
 
