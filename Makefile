@@ -1,14 +1,14 @@
 # make demo   bake a bundled example and say where the results are
 # make test   everything that has to hold
 # make lint   the static part of it
-# make chaos  bakes under 200 faults: killed processes, cut wires, full disks (about an hour; tests run a few)
-# make hostile   the long run of schemathesis over the interface
+# make chaos  bakes under 200 faults: killed processes, cut wires, flipped bytes, set clocks (about an hour)
+# make hostile  thousands of attacks while another client bakes, then schemathesis at length (about half an hour)
 # make venv   the virtual environment in .venv that these use
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test hostile lint node chromium chaos clean
+.PHONY: help venv demo test hostile lint node chromium faketime chaos clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -40,19 +40,26 @@ node:
 chromium:
 	@deploy/install/chromium.sh
 
+faketime:
+	@deploy/install/faketime.sh
+
 ## Tests that kill processes and time what they do run one after the other, all others side by side.
 ALONE := tests/chaos tests/e2e tests/service/test_replicas.py
 
-test: lint node chromium
+test: lint node chromium faketime
 	$(BIN)/pytest $(ALONE)
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile $(ALONE:%=--ignore=%)
 
+## Where the programs among the tests find what they share.
+FARM_TESTS := tests/e2e:tests/store:tests/hostile
+
 hostile: venv
+	PYTHONPATH=$(FARM_TESTS) $(BIN)/python tests/hostile/siege.py --json docs/results/hostile.json --page docs/results/hostile.md
 	LIGHTKILN_HOSTILE_EXAMPLES=400 $(BIN)/pytest tests/hostile/test_openapi.py -q -rP
 
-chaos: venv
-	PYTHONPATH=tests/e2e:tests/store $(BIN)/python tests/chaos/chaos.py --store disk --faults 100 --json docs/results/chaos-disk.json
-	PYTHONPATH=tests/e2e:tests/store $(BIN)/python tests/chaos/chaos.py --store s3 --faults 100 --json docs/results/chaos-s3.json
+chaos: venv faketime
+	PYTHONPATH=$(FARM_TESTS) $(BIN)/python tests/chaos/chaos.py --store disk --faults 120 --json docs/results/chaos-disk.json
+	PYTHONPATH=$(FARM_TESTS) $(BIN)/python tests/chaos/chaos.py --store s3 --faults 100 --json docs/results/chaos-s3.json
 
 clean:
 	rm -rf $(VENV) demo demo.partial

@@ -2,33 +2,40 @@
 
 import contextlib
 import os
+import secrets
 import subprocess
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import httpx
 import psutil
 from e2e_farm import Farm
+from farm_clock import FarmClock
 from faulty_proxy import FaultyProxy
 
 RESTART_S = 1.0
 """Between the end of a process and its next start (RestartSec of deploy/lightkiln-worker.service is 5 s)."""
 WORKERS = ("one", "two")
+MARK = "LIGHTKILN_CHAOS_FARM"
+"""Variable in the environment of all processes of a farm, by which those that were left behind are found."""
 
 
 class ChaosFarm(Farm):
     """A coordinator and two workers, each under a supervisor; workers reach the coordinator through `wire`."""
 
     wire: FaultyProxy
+    clock: FarmClock
     flags: tuple[str, ...] = ()
     restarts: int = 0
 
     def open(self, *flags: str) -> None:
         """Start everything; `flags` are the coordinator's."""
-        self.flags = flags
+        self.flags, self._mark = flags, secrets.token_hex(8)
+        self.clock = FarmClock(self.folder)
         self.start_coordinator(*flags)
         self.wire = FaultyProxy(self.port)
         for name in WORKERS:
@@ -44,6 +51,15 @@ class ChaosFarm(Farm):
         self.stop()
         self.wire.close()
 
+    def leaked(self) -> list[psutil.Process]:
+        """Processes of this farm that run though it is closed."""
+        found = []
+        for process in psutil.process_iter():
+            with contextlib.suppress(psutil.Error):
+                if process.environ().get(MARK) == self._mark and process.status() != psutil.STATUS_ZOMBIE:
+                    found.append(process)
+        return found
+
     def start_worker(self, name: str, *flags: str, preexec: Any = None) -> None:
         port, self.port = self.port, self.wire.port
         try:
@@ -53,18 +69,22 @@ class ChaosFarm(Farm):
 
     def ask(self, method: str, path: str, **parameters: Any) -> Any:
         """The coordinator's answer as JSON, past the wire; None while it has none to give."""
-        headers = {"Authorization": f"Bearer {self.token}"}
-        try:
-            reply = httpx.request(method, self.url + path, params=parameters, headers=headers, timeout=20)
-        except httpx.TransportError:
-            return None
-        if reply.status_code >= 500:
+        reply = self.send(method, path, params=parameters)
+        if reply is None or reply.status_code >= 500:
             return None
         assert reply.is_success, reply.text
         return reply.json() if reply.content else {}
 
+    def send(self, method: str, path: str, **request: Any) -> httpx.Response | None:
+        """The coordinator's answer, past the wire; None where it ends the connection or does not listen."""
+        headers = {"Authorization": f"Bearer {self.token}"}
+        try:
+            return httpx.request(method, self.url + path, headers=headers, timeout=60, **request)
+        except httpx.TransportError:
+            return None
+
     def postgres(self) -> tuple[psutil.Process, list[psutil.Process]]:
-        """The postmaster and its backends; raises psutil.Error where it is not there."""
+        """The postmaster and its backends; raises psutil.Error or ValueError where it is not there."""
         parent = psutil.Process(self.processes["coordinator"].pid)
         [server] = [child for child in parent.children() if child.name() == "postgres"]
         return server, [child for child in server.children() if "[local]" in " ".join(child.cmdline())]
@@ -74,6 +94,29 @@ class ChaosFarm(Farm):
         process = psutil.Process(self.processes[name].pid)
         for victim in (process, *process.children()):
             victim.send_signal(number)
+
+    def kill_everything(self) -> None:
+        """kill -9 of every process of the farm, as a power cut does it."""
+        victims = []
+        for process in list(self.processes.values()):
+            with contextlib.suppress(psutil.Error):
+                started = psutil.Process(process.pid)
+                victims += [started, *started.children(recursive=True)]
+        for victim in victims:
+            with contextlib.suppress(psutil.Error):
+                victim.kill()
+
+    def scratch(self, name: str) -> Path:
+        """The folder of a worker."""
+        return self.folder / f"scratch-{name}"
+
+    def environment(self, name: str) -> dict[str, str]:
+        """Of a process of the farm. Workers have the true time: they look at no wall clock, and libfaketime is slow."""
+        return os.environ | {MARK: self._mark} | (self.clock.environment() if name == "coordinator" else {})
+
+    def _start(self, name: str, arguments: list[str], preexec: Any = None) -> None:
+        with patch.dict(os.environ, self.environment(name)):
+            super()._start(name, arguments, preexec)
 
     def _supervise(self) -> None:
         ended: dict[str, float] = {}
