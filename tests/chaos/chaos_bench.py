@@ -27,8 +27,8 @@ from kiln_workers.package.glb import encode_glb
 from kiln_workers.scene.examples import write_exr
 
 SMALL = (
-    *("lightmap.tile=4", "render.irradiance_samples=16", "fit.lobes=4", "fit.start_steps=20"),
-    *("fit.visibility_steps=20", "fit.refine_steps=8", "fit.checkpoint_s=1"),
+    *("lightmap.tile=4", "render.irradiance_samples=16", "fit.lobes=4", "fit.start_steps=60"),
+    *("fit.visibility_steps=60", "fit.refine_steps=20", "fit.checkpoint_s=1"),
 )
 """Tasks so short that the time to the next one committed is that of the recovery and not of the task."""
 OVER = ("completed", "gate-failed", "failed", "canceled")
@@ -66,6 +66,7 @@ class Bench:
         """An undisturbed bake, then so many faults, all kinds in turn, then the last bake to its end."""
         self._submit()
         self._settle(wait=True)
+        assert self._expected, "the undisturbed bake failed"
         turn: list[str] = []
         kinds = faults_of(self)
         while len(self.recoveries) < faults and time.monotonic() < until:

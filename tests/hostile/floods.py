@@ -10,7 +10,7 @@ import resource
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, Final
 
 import httpx
@@ -37,9 +37,7 @@ def half_sent(ground: Ground) -> Tally:
         connections = []
         for number in range(many):
             with contextlib.suppress(OSError):
-                connection = stack.enter_context(
-                    socket.create_connection((("127.0.0.1"), ground.farm.port), timeout=20)
-                )
+                connection = stack.enter_context(socket.create_connection(("127.0.0.1", ground.farm.port), timeout=20))
                 connection.sendall(begun[number % len(begun)])
                 connections.append(connection)
         served = _served(ground)
@@ -248,12 +246,12 @@ def _status(connection: socket.socket) -> int:
 
 
 def _is_closed(connection: socket.socket) -> bool:
-    try:
-        return connection.recv(1) == b"" or True
-    except BlockingIOError:
-        return False
-    except OSError:
+    """Whether the coordinator has ended a connection, with an answer or without; it is not blocking."""
+    with contextlib.suppress(BlockingIOError):
+        with contextlib.suppress(ConnectionError):
+            connection.recv(1)
         return True
+    return False
 
 
 def _served(ground: Ground) -> bool:
@@ -268,6 +266,3 @@ def _served(ground: Ground) -> bool:
 
 def _plain(scope: str) -> tuple[Any, ...]:
     return {"read": ("/v1/jobs",), "submit": ("/v1/blobs/missing",), "worker": ("/v1/workers",)}[scope]
-
-
-Flood = Callable[[Ground], Tally]

@@ -69,10 +69,8 @@ def claimed(ground: Ground) -> Tally:
             url = _claim_url(what, robber, claim)
             reply = ground.send("worker", "POST", url, content=content, headers=JSON)
             _judge(tally, f"{what}: {variant.name}", reply, variant.refused)
-            for view in ("/v1/jobs", "/v1/metrics", f"/v1/jobs/{jobs[-1]}"):
-                seen = ground.send("admin", "GET", view)
-                if (status := 0 if seen is None else seen.status_code) != 200:
-                    tally.count(False, f"{view} after {what}: {variant.name}: {status}", status)
+            if reply is not None and reply.is_success:
+                _look(ground, tally, jobs[-1], f"{what}: {variant.name}")
             if what in ("fail", "commit") and reply is not None and reply.status_code in (204, 404, 409):
                 following = robber.claim(0)
                 if following is None:
@@ -192,6 +190,14 @@ def _judge(tally: Tally, what: str, reply: httpx.Response | None, refused: bool)
     if status >= 400:
         holds &= is_problem and len(reply.content) < QUIET
     tally.count(holds, f"{what}: {status} {reply.text[:200]}", status)
+
+
+def _look(ground: Ground, tally: Tally, job: str, after: str) -> None:
+    """Views go on whatever is in their rows."""
+    for view in ("/v1/jobs", "/v1/metrics", f"/v1/jobs/{job}"):
+        seen = ground.send("admin", "GET", view)
+        if (status := 0 if seen is None else seen.status_code) != 200:
+            tally.count(False, f"{view} after {after}: {status}", status)
 
 
 def _with_tiles(ground: Ground) -> tuple[Robber, str]:
