@@ -53,9 +53,9 @@ class Ground:
     """A farm under attack. `rounds` counts those of the other client, `honest_job` is the one that it bakes."""
 
     def __init__(
-        self, farm: Farm, *, long: bool, seed: int, rounds: Callable[[], int], honest_job: Callable[[], str]
+        self, farm: Farm, *, amount: float, seed: int, rounds: Callable[[], int], honest_job: Callable[[], str]
     ) -> None:
-        self.farm, self.long, self.seed = farm, long, seed
+        self.farm, self.amount, self.seed = farm, amount, seed
         self.rounds, self.honest_job = rounds, honest_job
         self.tokens: dict[str, str] = {}
         self.clients: dict[str, httpx.Client] = {}
@@ -75,8 +75,8 @@ class Ground:
             client.close()
 
     def many(self, short: int, long: int) -> int:
-        """How often: in the short run, in the long one."""
-        return long if self.long else short
+        """How often: `short` in the tests, `long` in the whole run, between them in a part of it."""
+        return round(short + self.amount * (long - short))
 
     def send(self, scope: str, method: str, path: str, **request: Any) -> httpx.Response | None:
         """The answer to an attempt, None where the connection ends without; one that is told to wait waits."""

@@ -1,7 +1,7 @@
 """A farm under attack while another client bakes: prints what was tried and what held, and writes JSON.
 
     make hostile
-    python tests/hostile/siege.py [--short] [--seed 1] [--only CLASS] [--json FILE]
+    python tests/hostile/siege.py [--amount 0.5] [--seed 1] [--only CLASS] [--json FILE]
 
 The other client (`other_client`) bakes and looks at the farm without a pause, first undisturbed, then during each
 class of attacks. Its bakes must end with the same bytes, its answers must come, and how much longer than undisturbed
@@ -72,7 +72,7 @@ class Siege:
 
     farm: Farm
     log: Path
-    long: bool
+    amount: float
     seed: int
     tallies: dict[str, Tally] = field(default_factory=dict)
     spans: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -91,7 +91,7 @@ class Siege:
             before = coordinator.memory_info().rss
             ground = Ground(
                 self.farm,
-                long=self.long,
+                amount=self.amount,
                 seed=self.seed,
                 rounds=lambda: len(self._lines("round")),
                 honest_job=self._job,
@@ -203,14 +203,14 @@ def high(values: list[float]) -> float:
 
 
 @contextlib.contextmanager
-def siege(folder: Path, *, long: bool, seed: int) -> Iterator[Siege]:
+def siege(folder: Path, *, amount: float, seed: int) -> Iterator[Siege]:
     """A farm with a worker for the other client; its processes are the same at the end."""
     farm = Farm(folder / "farm", config=CONFIG)
     farm.folder.mkdir()
     try:
         farm.start_coordinator()
         farm.start_worker("honest", "--threads", "1", "--tag", TAG)
-        yield Siege(farm, folder / "other.jsonl", long, seed)
+        yield Siege(farm, folder / "other.jsonl", amount, seed)
     finally:
         farm.stop()
 
@@ -265,7 +265,7 @@ def table(result: Mapping[str, Any]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--short", action="store_true", help="as the tests have it")
+    parser.add_argument("--amount", type=float, default=1.0, help="0: as the tests have it; 1: all that there is")
     parser.add_argument("--seed", type=int, default=random.randrange(1 << 16))
     parser.add_argument("--only", action="append", choices=ATTACKS, help="a class; may be repeated")
     parser.add_argument("--json", type=Path)
@@ -276,7 +276,7 @@ def main() -> int:
     attacks = {name: attack for name, attack in ATTACKS.items() if name in (arguments.only or ATTACKS)}
     with (
         tempfile.TemporaryDirectory(prefix="lightkiln-hostile-") as folder,
-        siege(Path(folder), long=not arguments.short, seed=arguments.seed) as running,
+        siege(Path(folder), amount=arguments.amount, seed=arguments.seed) as running,
     ):
         running.run(attacks)
         result = report(running)

@@ -22,7 +22,7 @@ SEED = 11
 def ended() -> Iterator[Siege]:
     """The siege after its last attack."""
     # Not under pytest's folder, which is private to this user: the database server is another one.
-    with TemporaryDirectory(prefix="lightkiln-hostile-") as folder, siege(Path(folder), long=False, seed=SEED) as run:
+    with TemporaryDirectory(prefix="lightkiln-hostile-") as folder, siege(Path(folder), amount=0, seed=SEED) as run:
         run.run(ATTACKS)
         yield run
 
