@@ -1,7 +1,7 @@
 """Bakes of a small scene under faults of every kind: prints a table and writes JSON.
 
     make chaos
-    python tests/chaos/chaos.py [--faults 200] [--seed 1] [--store disk] [--minutes 30] [--json FILE]
+    python tests/chaos/chaos.py [--faults 200] [--seed 1] [--store disk] [--minutes 30] [--only KIND] [--json FILE]
 
 Processes are killed and ended, wires cut, writes refused, bytes flipped, light fields deleted, clocks set: one fault
 after the other, of all kinds in turn and at random moments (`chaos_faults`, `chaos_bench`).
@@ -75,13 +75,14 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=int(time.time()))
     parser.add_argument("--store", choices=("s3", "disk"), default="disk")
     parser.add_argument("--minutes", type=float, default=180.0, help="no new fault after so long")
+    parser.add_argument("--only", action="append", default=[], help="a kind of fault; may be repeated")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # and so through the end of what was started
     print(f"seed {arguments.seed}", flush=True)
     with tempfile.TemporaryDirectory(prefix="lightkiln-chaos-") as name:
         with bench(Path(name), arguments.store, arguments.seed) as running:
-            running.run(arguments.faults, time.monotonic() + 60 * arguments.minutes)
+            running.run(arguments.faults, time.monotonic() + 60 * arguments.minutes, arguments.only)
         result = report(running, arguments.seed, arguments.store)
     print(table(result))
     if arguments.json:

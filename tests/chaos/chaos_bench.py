@@ -11,7 +11,7 @@ import random
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -62,13 +62,13 @@ class Bench:
         (folder / "room.glb").write_bytes(encode_glb(room()))
         write_exr(folder / "sky.exr", sky())
 
-    def run(self, faults: int, until: float) -> None:
-        """An undisturbed bake, then so many faults, all kinds in turn, then the last bake to its end."""
+    def run(self, faults: int, until: float, only: Collection[str] = ()) -> None:
+        """An undisturbed bake, then so many faults, all kinds in turn or some, then the last bake to its end."""
         self._submit()
         self._settle(wait=True)
         assert self._expected, "the undisturbed bake failed"
         turn: list[str] = []
-        kinds = faults_of(self)
+        kinds = {kind: fault for kind, fault in faults_of(self).items() if not only or kind in only}
         while len(self.recoveries) < faults and time.monotonic() < until:
             self._settle(wait=False)
             time.sleep(self.chance.uniform(0.0, 3.0))
