@@ -141,9 +141,7 @@ class Bench:
 
     def _judge(self, state: str, events: list[dict[str, Any]], tasks: list[dict[str, Any]]) -> None:
         completed = Counter(event["task_id"] for event in events if event["kind"] == "task.completed")
-        # A task whose light fields were lost is queued again, and its second completion is no double.
-        again = Counter(event["task_id"] for event in events if event["kind"] == "task.requeued")
-        self.verdicts["tiles_doubled"] += sum(count > 1 + again[task] for task, count in completed.items())
+        self.verdicts["tiles_doubled"] += doubled(events)
         if state != "completed":
             self.verdicts["bakes_failed"] += 1
             view = self.farm.ask("GET", f"/v1/jobs/{self.job}") or {}
@@ -199,6 +197,18 @@ class Bench:
     def _tell_history(self, seconds: float) -> None:
         for event in self._events(self.job)[-40:]:
             self.note(f"{event['at']} {event['kind']} {event['detail']}")
+
+
+def doubled(events: list[dict[str, Any]]) -> int:
+    """How many tasks were completed once more though nothing that they had made was lost in between."""
+    count, completed = 0, set[str]()
+    for event in events:
+        if event["kind"] == "tasks.lost":
+            completed.clear()
+        elif event["kind"] == "task.completed":
+            count += event["task_id"] in completed
+            completed.add(event["task_id"])
+    return count
 
 
 def pace(events: list[dict[str, Any]]) -> dict[str, float]:
