@@ -35,7 +35,7 @@ class ChaosFarm(Farm):
     def open(self, *flags: str) -> None:
         """Start everything; `flags` are the coordinator's."""
         self.flags, self._mark = flags, secrets.token_hex(8)
-        self.clock = FarmClock(self.folder)
+        self.clock = FarmClock()
         self.start_coordinator(*flags)
         self.wire = FaultyProxy(self.port)
         for name in WORKERS:
@@ -50,6 +50,7 @@ class ChaosFarm(Farm):
         self._supervisor.join()
         self.stop()
         self.wire.close()
+        self.clock.close()
 
     def leaked(self) -> list[psutil.Process]:
         """Processes of this farm that run though it is closed."""

@@ -19,21 +19,22 @@ KINDS = ["prepare", "render", "fit", "refine", "package"]
 def restart_in_claim(farm: ChaosFarm, mode: str) -> None:
     """Restart the database server while a claim's transaction is open; `mode` is pg_ctl's (fast or immediate)."""
     server, _ = farm.postgres()
-    arguments = server.cmdline()
-    folder, sockets = arguments[arguments.index("-D") + 1], arguments[arguments.index("-k") + 1]
+    # The server names its folder by its working directory, as its user may not be let through the folders above.
+    folder, own = server.cwd(), "/proc/self/cwd"
     pg_ctl, owner = Path(server.exe()).with_name("pg_ctl"), server.uids().real
-    with psycopg.connect(f"host='{sockets}' user=postgres dbname=postgres", autocommit=False) as holder:
+    dsn = f"host='{folder}' user=postgres dbname=postgres"
+    with psycopg.connect(dsn, autocommit=False) as holder:
         holder.execute("LOCK TABLE tasks IN ACCESS EXCLUSIVE MODE")
-        with psycopg.connect(f"host='{sockets}' user=postgres dbname=postgres", autocommit=True) as watcher:
+        with psycopg.connect(dsn, autocommit=True) as watcher:
             wait_until("a claim waits in its transaction", _claiming(farm, watcher))
         # The new server is no child of the coordinator, which therefore ends and starts its own.
         subprocess.run(
-            [str(pg_ctl), "restart", "-D", folder, "-m", mode, "-o", f"-k '{sockets}' -c listen_addresses=''", "-w"],
+            [str(pg_ctl), "restart", "-D", own, "-m", mode, "-o", f"-k {own} -c listen_addresses=''", "-w"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             user=owner if os.geteuid() == 0 else None,
             env=farm.environment("coordinator"),
-            cwd="/",
+            cwd=folder,
             timeout=120,
         )
 

@@ -5,6 +5,7 @@ are started with `environment`: the coordinator, and the database server, which 
 """
 
 import os
+import tempfile
 from pathlib import Path
 from typing import Final
 
@@ -13,10 +14,12 @@ SLEEP: Final = Path(__file__).with_name("set_clock")
 
 
 class FarmClock:
-    """A clock that starts right; `folder` must be one that the database's user may pass through."""
+    """A clock that starts right. Its file lies where every user may read it: the database server has one of its own."""
 
-    def __init__(self, folder: Path) -> None:
-        self._file, self.offset_s = folder / "clock", 0
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="lightkiln-clock-")
+        Path(self._folder.name).chmod(0o755)
+        self._file, self.offset_s = Path(self._folder.name) / "clock", 0
         self._library = next(iter(sorted(Path("/usr/lib").glob(LIBRARY))), None)
         self._file.write_bytes(self._line())
         self._file.chmod(0o644)
@@ -39,6 +42,10 @@ class FarmClock:
             "FAKETIME_DONT_FAKE_MONOTONIC": "1",
             "PYTHONPATH": os.pathsep.join(paths),
         }
+
+    def close(self) -> None:
+        """Remove the file; no process may have this clock any more."""
+        self._folder.cleanup()
 
     def set(self, offset_s: int) -> None:
         """Set the clock to so many seconds after the true time, for all processes at once."""

@@ -23,8 +23,7 @@ MINUTES_S = 120
 def server() -> Iterator[tuple[EmbeddedPostgres, FarmClock]]:
     """A database server whose processes alone have a clock of their own."""
     with TemporaryDirectory(prefix="kiln-test-") as folder:
-        Path(folder).chmod(0o755)
-        clock = FarmClock(Path(folder))
+        clock = FarmClock()
         assert clock.works, "libfaketime is missing: deploy/install/faketime.sh"
         settings = {"fsync": "off", "full_page_writes": "off"}
         with (
@@ -32,6 +31,7 @@ def server() -> Iterator[tuple[EmbeddedPostgres, FarmClock]]:
             EmbeddedPostgres(Path(folder) / "postgres", settings) as server,
         ):
             yield server, clock
+        clock.close()
 
 
 @pytest.fixture
