@@ -87,7 +87,7 @@ class Bench:
             tasks = self.farm.ask("GET", f"/v1/jobs/{self.job}/tasks", kind=stage, state="active") or []
             return tasks[0] if tasks else None
 
-        task: dict[str, Any] = wait_until(f"{stage} is at work", active, 2 * GIVEN_UP_S)
+        task: dict[str, Any] = wait_until(f"{stage} is at work", active, 4 * GIVEN_UP_S)
         return task
 
     def note(self, text: str) -> None:
@@ -114,7 +114,7 @@ class Bench:
             if time.monotonic() - moved > GIVEN_UP_S:
                 self.verdicts["not_recovered"] += 1
                 break
-            time.sleep(0.1)
+            time.sleep(0.25)
         seconds = time.monotonic() - began
         self.recoveries.append((kind, seconds))
         self.note(f"{len(self.recoveries):4d} {kind:28} recovered in {seconds:5.1f} s")

@@ -21,7 +21,7 @@ TAG: Final = "hostile"
 SCENE: Final = b"no scene at all"
 SHOWN: Final = 30
 """Broken attempts that a tally describes."""
-PATIENCE_S: Final = 120.0
+PATIENCE_S: Final = 600.0
 """An answer that takes so long does not come; no bound on a farm's speed."""
 BUSY: Final = 429
 LEAST_STREAMED: Final = 256
