@@ -11,7 +11,7 @@ from pydantic import Field
 from kiln_schemas.base import Contract, Count, Detail, Id, Magnitude, Name, Real, Seconds, Word
 from kiln_schemas.errors import InputError, Problem
 from kiln_schemas.gates import MOST_CAMERAS, Cameras, GateResult, Gates
-from kiln_schemas.settings import BakeSettings
+from kiln_schemas.settings import LARGEST_SIDE, SMALLEST_SIDE, BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import MOST_NOTES, MOST_POINTS, PATH_LENGTH, Bundle, Progress, Sha256, Tags, TaskKind
 from kiln_schemas.text import LINE_BREAK, UNFIT, Line, Note, is_line, told
@@ -116,6 +116,8 @@ class JobView(Contract):
     """How it ended, also when it is archived; None before."""
     submitter: Name | None = None
     """Name of the token it was submitted with."""
+    lightmap_side: int | None = Field(default=None, ge=SMALLEST_SIDE, le=LARGEST_SIDE)
+    """Texels along each side of the light map; None as long as it is `auto` and not chosen."""
     renders_of: Id | None = None
     """The job whose light fields it uses, where they are the same; nothing was rendered again then."""
 

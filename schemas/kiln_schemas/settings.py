@@ -6,9 +6,10 @@ A preset is a complete set of settings; overrides name a field by its dotted pat
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, PlainValidator, ValidationError, WithJsonSchema, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 from kiln_schemas.base import Contract, Word
 from kiln_schemas.errors import InputError
@@ -43,13 +44,65 @@ class Solver(StrEnum):
     """The network's own output (Currius et al. 2020)."""
 
 
+AUTO: Final = "auto"
+SMALLEST_SIDE: Final = 8
+LARGEST_SIDE: Final = 8192
+
+
+def _side(value: object) -> int | str:
+    """Texels along a side, or AUTO."""
+    if value == AUTO:
+        return AUTO
+    if isinstance(value, str) and value.strip().isdecimal() and len(value) < 20:
+        value = int(value)
+    if not isinstance(value, int) or isinstance(value, bool) or not SMALLEST_SIDE <= value <= LARGEST_SIDE:
+        raise PydanticCustomError(
+            "side", f"must be 'auto' or a whole number of texels from {SMALLEST_SIDE} to {LARGEST_SIDE}"
+        )
+    return value
+
+
+Resolution = Annotated[
+    int | Literal["auto"],
+    PlainValidator(_side),
+    WithJsonSchema(
+        {"anyOf": [{"type": "integer", "minimum": SMALLEST_SIDE, "maximum": LARGEST_SIDE}, {"const": AUTO}]}
+    ),
+]
+
+
 class LightmapSettings(Contract):
     """The light map: one atlas for the whole scene."""
 
-    resolution: int = Field(ge=8, le=8192, description="texels along each side")
+    resolution: Resolution = Field(
+        default="auto",
+        description="texels along each side; auto: as many as `density` and the charts need, from `least` to `most`",
+    )
+    density: float = Field(default=8.0, gt=0, le=1e6, description="texels a metre that `auto` aims at")
+    least: int = Field(default=32, ge=SMALLEST_SIDE, le=LARGEST_SIDE, description="texels a side that `auto` begins at")
+    most: int = Field(
+        default=512,
+        ge=SMALLEST_SIDE,
+        le=LARGEST_SIDE,
+        description="texels a side that `auto` ends at, unless the charts find no room in them",
+    )
     padding: int = Field(default=2, ge=1, le=16, description="empty texels between charts when unwrapping")
     uv: UvPolicy = UvPolicy.AUTO
     tile: int = Field(default=16, ge=4, le=64, description="texels along each side of a render tile")
+
+    def side(self, chosen: int | None) -> int:
+        """Texels along each side: the number in the settings, or at `auto` what the prepare task chose."""
+        if self.resolution != AUTO:
+            return self.resolution
+        if chosen is None:
+            raise InputError("the prepare task chose no resolution", where="lightmap.resolution")
+        return chosen
+
+    @model_validator(mode="after")
+    def _bounds_in_order(self) -> "LightmapSettings":
+        if self.least > self.most:
+            raise PydanticCustomError("bounds", f"least is {self.least}, which is more than most, {self.most}")
+        return self
 
 
 class RenderSettings(Contract):
@@ -119,20 +172,20 @@ class BakeSettings(Contract):
 PRESETS: Final[Mapping[str, BakeSettings]] = {
     "draft": BakeSettings(
         preset="draft",
-        lightmap=LightmapSettings(resolution=32, tile=8),
+        lightmap=LightmapSettings(density=1.4, least=32, most=128, tile=8),
         render=RenderSettings(image_size=32, samples=32, irradiance_samples=512),
         fit=FitSettings(lobes=8, steps=1000, start_steps=500, visibility_steps=500),
         package=PackageSettings(environment_size=64),
     ),
     "preview": BakeSettings(
         preset="preview",
-        lightmap=LightmapSettings(resolution=64),
+        lightmap=LightmapSettings(density=2.8, least=64, most=256),
         render=RenderSettings(image_size=64, samples=128),
         fit=FitSettings(lobes=16, steps=2500),
     ),
     "production": BakeSettings(
         preset="production",
-        lightmap=LightmapSettings(resolution=512),
+        lightmap=LightmapSettings(density=22.0, least=512, most=1024),
         render=RenderSettings(image_size=128, samples=128, irradiance_samples=4096, max_depth=8),
         fit=FitSettings(lobes=16, steps=60_000, start_steps=20_000, visibility_steps=24_000),
         package=PackageSettings(environment_size=256),

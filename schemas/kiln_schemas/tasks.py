@@ -13,7 +13,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from kiln_schemas.base import Contract, Count, Id, Magnitude, Name, Real, Seconds, Url, Word
 from kiln_schemas.errors import InputError, Problem
 from kiln_schemas.gates import MOST_CAMERAS, Cameras, GateResult, Gates
-from kiln_schemas.settings import BakeSettings, Function
+from kiln_schemas.settings import LARGEST_SIDE, SMALLEST_SIDE, BakeSettings, Function
 from kiln_schemas.text import Line, Log, Note, Told
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", max_length=64)]
@@ -24,6 +24,7 @@ Number = Annotated[int, Field(ge=0, lt=2**31)]
 Bytes = Annotated[int, Field(ge=0, lt=2**63)]
 MOST_TILES: Final = 65536
 """Of a job; the coordinator's configuration may allow fewer."""
+MOST_PLACEMENTS: Final = 65536
 MOST_NOTES: Final = 1001
 """Of a scene: a thousand, and one that tells how many are left out."""
 MOST_POINTS: Final = 10_000
@@ -148,6 +149,14 @@ Payload = Annotated[
 ]
 
 
+class Placement(Contract):
+    """Where the whole light-map UV set of a mesh lies in the light map: uv' = uv * scale + offset."""
+
+    mesh: Name
+    scale: Magnitude
+    offset: tuple[Real, Real]
+
+
 class PrepareResult(Contract):
     kind: Literal[TaskKind.PREPARE] = TaskKind.PREPARE
     scene: Sha256
@@ -158,6 +167,10 @@ class PrepareResult(Contract):
     """Texel maps of the points half-way between texels: to the right, below, and the corner; none where unused."""
     scene_hash: Sha256
     """Hash of all that the light depends on; render seeds derive from it."""
+    resolution: int | None = Field(default=None, ge=SMALLEST_SIDE, le=LARGEST_SIDE)
+    """Texels along each side of the light map; None in results from before it could be chosen (`auto`)."""
+    placements: tuple[Placement, ...] = Field(default=(), max_length=MOST_PLACEMENTS)
+    """Of meshes whose own light-map UV was packed as a whole, the first of them."""
     tiles: tuple[Tile, ...] = Field(max_length=MOST_TILES)
     """Only tiles with at least one texel."""
     has_environment: bool

@@ -6,7 +6,7 @@ is the first method: prepare > render (one task a tile) > fit (one task a functi
 light map, unless the network's lobes are final) > package.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, Final
@@ -14,7 +14,7 @@ from typing import Any, Final
 from kiln_schemas.errors import InputError, TooLarge
 from kiln_schemas.gates import VISIBILITY_LOG_MSE_REL, Gates
 from kiln_schemas.settings import BakeSettings, Function, Solver
-from kiln_schemas.tasks import Block, PrepareResult, TaskKind, Tile
+from kiln_schemas.tasks import Block, PrepareResult, TaskKind
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def plan_after_prepare(result: PrepareResult, settings: BakeSettings, gates: Gat
     ]
     functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if result.has_environment else [])
     fits = [Planned(TaskKind.FIT, function.value, {"function": function.value}) for function in functions]
-    blocks = plan_blocks(result.tiles, settings) if settings.fit.solver is Solver.COHERENT else []
+    blocks = plan_blocks(result, settings) if settings.fit.solver is Solver.COHERENT else []
     if len(blocks) > most_tiles:
         raise TooLarge(
             f"{len(blocks)} blocks to refine are more than {most_tiles}",
@@ -95,11 +95,11 @@ def plan_after_prepare(result: PrepareResult, settings: BakeSettings, gates: Gat
     return [*renders, *fits, *refines, Planned(TaskKind.PACKAGE, "package")]
 
 
-def plan_blocks(tiles: Iterable[Tile], settings: BakeSettings) -> list[Block]:
+def plan_blocks(result: PrepareResult, settings: BakeSettings) -> list[Block]:
     """Squares of `fit.block` texels, row by row, that a tile touches."""
-    size, resolution = settings.fit.block, settings.lightmap.resolution
+    size, resolution = settings.fit.block, settings.lightmap.side(result.resolution)
     places = set()
-    for tile in tiles:
+    for tile in result.tiles:
         rows = range(tile.row // size, (min(tile.row + tile.size, resolution) - 1) // size + 1)
         columns = range(tile.column // size, (min(tile.column + tile.size, resolution) - 1) // size + 1)
         places |= set(product(rows, columns))
@@ -126,7 +126,7 @@ def _check_prepared(result: PrepareResult, settings: BakeSettings, most_tiles: i
             remedy="Raise lightmap.tile or lower lightmap.resolution.",
         )
     places = {(tile.row, tile.column) for tile in result.tiles}
-    resolution = settings.lightmap.resolution
+    resolution = settings.lightmap.side(result.resolution)
     outside = [tile for tile in result.tiles if max(tile.row, tile.column) >= resolution or tile.texels == 0]
     if len(places) < len(result.tiles) or outside:
         raise InputError(

@@ -28,6 +28,8 @@ class TileMap:
 
     version: int
     """Id of the job's newest event."""
+    texels: int
+    """Along each side of the light map; 0 as long as its size is not chosen."""
     side: int
     """Tiles along each side."""
     cells: bytes
@@ -57,7 +59,9 @@ class TileMaps:
             if row is None:
                 raise NotFound(f"no job '{job_id}'", where="job")
             tile, version = row["tile"], row["version"]
-            side = -(-row["resolution"] // tile)
+            texels, side = row["resolution"], -(-row["resolution"] // tile)
+            if not side:
+                return TileMap(version, 0, 0, b"")
             about = {
                 "job_id": job_id,
                 "kind": TaskKind.RENDER.value,
@@ -65,7 +69,7 @@ class TileMaps:
                 "tile": tile,
                 "side": side,
             }
-            if known is not None:
+            if known is not None and known.side == side:
                 if known.version == version:
                     return known
                 since = await tx.one("changes_since", job_id=job_id, since=known.version, most=MOST_CHANGES + 1)
@@ -73,5 +77,5 @@ class TileMaps:
                     cells = bytearray(known.cells)
                     for changed in await tx.all("changed_tiles", **about, since=known.version):
                         cells[changed["cell"]] = changed["code"]
-                    return TileMap(version, side, bytes(cells))
-            return TileMap(version, side, bytes((await tx.one("all_tiles", **about))["cells"]))
+                    return TileMap(version, texels, side, bytes(cells))
+            return TileMap(version, texels, side, bytes((await tx.one("all_tiles", **about))["cells"]))

@@ -203,6 +203,7 @@ def _job_view(job: JobRow, rows: dict[str, DictRow]) -> JobView:
         "tags": job.tags,
         "outcome": job.outcome,
         "submitter": job.submitter,
+        "lightmap_side": job.lightmap_side,
         "renders_of": job.renders_of,
     }
     return readable(JobView, values)

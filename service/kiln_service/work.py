@@ -274,7 +274,7 @@ class Work:
             _check_same(job, result)
         elif isinstance(result, PrepareResult):
             await tx.run("add_notes", id=job.id, notes=Jsonb(list(result.notes)))
-            prepared = result.model_dump(mode="json", exclude={"tiles"})
+            prepared = result.model_dump(mode="json", exclude={"tiles", "placements"})
             await tx.run("set_prepared", id=job.id, prepared=Jsonb(prepared))
             try:
                 planned = plan_after_prepare(result, job.settings, job.gates, self._config.limits.tiles)

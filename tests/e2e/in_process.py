@@ -125,8 +125,7 @@ def bake(folder: Path, scene: Scene, settings: BakeSettings, **asked: Any) -> Ba
     functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if environment else [])
     fits = tuple(fit.run(FitPayload(function=f, renders=renders, **maps), context) for f in functions)
     refine_payloads = tuple(
-        RefinePayload(block=block, renders=renders, fit=fits[0], **placed)
-        for block in plan_blocks(prepared.tiles, settings)
+        RefinePayload(block=block, renders=renders, fit=fits[0], **placed) for block in plan_blocks(prepared, settings)
     )
     refines = tuple(refine.run(each, context) for each in refine_payloads)
     packaged = package.run(

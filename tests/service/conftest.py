@@ -185,6 +185,7 @@ def result_of(home: Coordinator, claim: dict[str, Any], tiles: int = 2, **change
                 "texel_map": home.upload(b"texel map"),
                 "between": [home.upload(f"points {kind}".encode()) for kind in range(3)],
                 "scene_hash": "0" * 64,
+                "resolution": 32,
                 "tiles": places,
                 "has_environment": False,
                 "has_light": True,

@@ -15,7 +15,7 @@ from kiln_service.views import remaining_seconds
 
 def prepared(tiles, **changes):
     about = {"scene": "0" * 64, "texel_map": "1" * 64, "scene_hash": "2" * 64, "triangles": 1, "seconds": 1.0}
-    about |= {"has_environment": True, "has_light": True}
+    about |= {"has_environment": True, "has_light": True, "resolution": 32}
     return PrepareResult(tiles=tuple(tiles), **about | changes)
 
 
@@ -47,7 +47,7 @@ def test_blocks_are_those_that_tiles_touch():
     """Also where tiles do not lie on the grid of the blocks; none where the network's lobes are final."""
     settings = make_settings("draft", ["lightmap.tile=24", "fit.block=16"])
     tiles = [Tile(row=0, column=0, size=24, texels=3), Tile(row=24, column=24, size=24, texels=1)]
-    places = [(block.row, block.column, block.size) for block in plan_blocks(tiles, settings)]
+    places = [(block.row, block.column, block.size) for block in plan_blocks(prepared(tiles), settings)]
     assert places == [(0, 0, 16), (0, 16, 16), (16, 0, 16), (16, 16, 16)]
     network = make_settings("draft", ["fit.solver=cnn"])
     planned = plan_after_prepare(prepared([tile(0, 0)]), network, Gates(), 100)
@@ -70,6 +70,7 @@ def test_stages_follow_each_other():
         (prepared([tile(0, 0), tile(0, 0)]), "overlap"),
         (prepared([tile(0, 32)]), "leave"),
         (prepared([tile(0, 0, texels=0)]), "empty"),
+        (prepared([tile(0, 0)], resolution=None), "chose no resolution"),
     ],
 )
 def test_what_cannot_be_baked(result, word):
@@ -85,7 +86,7 @@ def test_too_many_tiles():
 def test_too_many_blocks():
     """A tile of 64 texels holds 64 blocks of 8, which are tasks too."""
     settings = make_settings("production", ["fit.block=8", "lightmap.tile=64"])
-    result = prepared([Tile(row=0, column=64, size=64, texels=9)])
+    result = prepared([Tile(row=0, column=64, size=64, texels=9)], resolution=512)
     assert len(plan_after_prepare(result, settings, Gates(), 64)) == 1 + 2 + 64 + 1
     with pytest.raises(TooLarge, match="64 blocks to refine are more than 63") as refused:
         plan_after_prepare(result, settings, Gates(), 63)

@@ -99,7 +99,7 @@ def test_kill_and_restart(folder):
         assert reply.json() == {"stop": False, "reason": ""}
         result = {"kind": "prepare", "scene": sha256, "texel_map": sha256, "scene_hash": sha256, "seconds": 1}
         result |= {"tiles": [{"row": 0, "column": 0, "size": 8, "texels": 1}], "has_environment": False}
-        result |= {"has_light": True, "triangles": 1}
+        result |= {"has_light": True, "triangles": 1, "resolution": 32}
         commit = second.client.post(f"/v1/tasks/{claim['task_id']}/commit", json=held | {"result": result})
         assert commit.status_code == 204
         states = {s["kind"]: s["completed"] for s in second.client.get(f"/v1/jobs/{job['id']}").json()["stages"]}

@@ -136,7 +136,10 @@ async def archive(job_id: str, parts: PartsHere, who: Submitter) -> JobView | Re
 
 _TASKS: Final = TypeAdapter(tuple[TaskView, ...])
 _TILES: Final = problems(404) | {
-    200: {"description": "The map; X-Side tiles along each side", "content": {"application/octet-stream": {}}},
+    200: {
+        "description": "The map; X-Side tiles and X-Texels texels along each side",
+        "content": {"application/octet-stream": {}},
+    },
     304: {"description": "It is as the client has it (If-None-Match)"},
 }
 
@@ -173,6 +176,7 @@ async def tiles(job_id: str, parts: PartsHere, if_none_match: Annotated[str | No
     """A byte a tile, row by row: 0 no tile, else 1 plus the place of its state among the states of a task."""
     found = await parts.tile_maps.read(job_id)
     headers = {"ETag": f'"{found.version}"', "Cache-Control": "no-cache", "X-Side": str(found.side)}
+    headers["X-Texels"] = str(found.texels)
     if if_none_match == headers["ETag"]:
         return Response(status_code=304, headers=headers)
     return Response(found.cells, headers=headers, media_type="application/octet-stream")

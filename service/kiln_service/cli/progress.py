@@ -90,7 +90,7 @@ class BarDisplay:
 
     def _drawn(self, job: JobView, seen: Pictures) -> Iterator[Text]:
         size = self._live.console.size
-        if seen.tiles is not None:
+        if seen.tiles is not None and seen.tiles.side:
             room = max(2 * (size.height - len(job.stages) - len(seen.curves) - 4), 2)
             grid = tile_grid(seen.tiles, min(size.width - 1, room, MOST_CELLS))
             yield draw_grid(grid)

@@ -31,7 +31,7 @@ Stride = Annotated[int, Query(ge=1, le=64)]
 async def texels(job_id: str, parts: PartsHere, stride: Stride = 1) -> Response:
     """What every `stride`-th texel is, a byte each: 0 gutter, 1 valid, 2 inside geometry; 404 before it is known."""
     job = await _job(parts, job_id)
-    if job.settings.lightmap.resolution > MOST_STATES:
+    if (job.lightmap_side or 0) > MOST_STATES:
         raise NotFound("the light map is too large to tell its texels", where="lightmap.resolution")
     return _bytes(await (await _texel_map(parts, job)).states(stride))
 
@@ -58,7 +58,10 @@ async def irradiance(
 async def texel(job_id: str, row: Coordinate, column: Coordinate, parts: PartsHere) -> Response:
     """One texel: its normal, its light field as rendered (float16 in base64), and its lobes; why what is missing is."""
     job = await _job(parts, job_id)
-    if max(row, column) >= job.settings.lightmap.resolution:
+    side = job.lightmap_side
+    if side is None:
+        raise NotFound("the size of the light map is not chosen yet", where="prepare")
+    if max(row, column) >= side:
         raise InputError(f"the light map has no texel {row}, {column}", where="texel")
     told: dict[str, Any] = {"row": row, "column": column, "image_size": job.settings.render.image_size, "missing": {}}
     texel_map, side = await _texel_map(parts, job), job.settings.lightmap.tile
@@ -110,9 +113,9 @@ async def _rendered(parts: Parts, job_id: str, places: list[tuple[int, int]]) ->
 
 
 async def _texel_map(parts: Parts, job: JobRow) -> TexelMapReader:
-    if job.prepared is None:
+    if job.prepared is None or job.lightmap_side is None:
         raise NotFound("the texel map is not made yet", where="prepare")
-    reader = TexelMapReader(parts.blobs, job.prepared["texel_map"], job.settings.lightmap.resolution)
+    reader = TexelMapReader(parts.blobs, job.prepared["texel_map"], job.lightmap_side)
     await reader.open()
     return reader
 

@@ -12,7 +12,7 @@ from kiln_schemas.base import Contract
 from kiln_schemas.camera import Camera
 from kiln_schemas.errors import Problem
 from kiln_schemas.gates import GateResult, Gates
-from kiln_schemas.settings import BakeSettings
+from kiln_schemas.settings import AUTO, BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Bundle, Progress, TaskKind
 from kiln_service.db.lenient import note_unreadable, readable, readable_or, readable_problem, readable_rows
@@ -46,7 +46,7 @@ class JobRow(_Row):
     gate_results: tuple[GateResult, ...]
     store_url: str
     prepared: dict[str, Any] | None
-    """The result of the prepare task, without the tiles."""
+    """The result of the prepare task, without the tiles and what has one entry a mesh."""
     priority: int
     labels: dict[str, str]
     tags: tuple[str, ...]
@@ -58,6 +58,12 @@ class JobRow(_Row):
     created: datetime
     started: datetime | None
     finished: datetime | None
+
+    @property
+    def lightmap_side(self) -> int | None:
+        """Texels along each side of the light map; None as long as it is `auto` and not chosen."""
+        lightmap, chosen = self.settings.lightmap, (self.prepared or {}).get("resolution")
+        return None if lightmap.resolution == AUTO and chosen is None else lightmap.side(chosen)
 
     @classmethod
     def of(cls, row: DictRow) -> Self:

@@ -103,8 +103,10 @@ SELECT tasks.id AS task_id, tasks.kind, tasks.label, tasks.state,
 FROM tasks WHERE job_id = %(job_id)s AND kind = 'fit' ORDER BY ordinal;
 
 -- name: tile_map_version
--- How a job's light map is divided, and the job's newest event.
-SELECT (settings #>> '{lightmap,resolution}')::int AS resolution, (settings #>> '{lightmap,tile}')::int AS tile,
+-- How a job's light map is divided (0 texels as long as its size is not chosen), and the job's newest event.
+SELECT CASE WHEN settings #>> '{lightmap,resolution}' = 'auto' THEN COALESCE((prepared ->> 'resolution')::int, 0)
+            ELSE (settings #>> '{lightmap,resolution}')::int END AS resolution,
+       (settings #>> '{lightmap,tile}')::int AS tile,
        COALESCE((SELECT max(id) FROM events WHERE job_id = jobs.id), 0) AS version
 FROM jobs WHERE id = %(job_id)s;
 

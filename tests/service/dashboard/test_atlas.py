@@ -22,7 +22,7 @@ def test_tiles_are_told_with_their_states(home, job, rendered):
     assert told.headers["x-side"] == "4"
     assert states == ["completed", "completed", "queued", "queued", *12 * [None]]
     page = home.client.get(f"/jobs/{job}").text
-    assert 'data-resolution="32" data-tile="8" data-states="' + " ".join(TaskState) in page
+    assert 'data-tile="8" data-states="' + " ".join(TaskState) in page
 
 
 def test_texels_and_irradiance_are_thinned_by_a_stride(home, job, rendered):

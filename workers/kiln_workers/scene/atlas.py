@@ -1,197 +1,231 @@
-"""Light-map UVs for every mesh: keep the scene's own set where it is a unique one, else unwrap all.
+"""The light map of a scene: its size, and UVs for every mesh, kept, packed by object or unwrapped.
 
-A set is usable if every mesh has it, it lies in [0, 1], every face has an area in it, and no two faces overlap. Overlap
-is tested on the faces' interiors, not on shared texels: on a grid four times finer than the light map, a sample
-deep inside two faces is overlap, so edges that charts or neighbours share are not. Overlap of up to one texel in all
-passes, as exporters round. Instances that share one set overlap by this test, so a scene with them is unwrapped.
+- Where the sets of all meshes together are one atlas (`uv_faults`), they are kept as they are.
+- Where each mesh has a set without a fault but they overlap each other, as Unity, Blender and Bakery make them, each
+  set stays as it is and gets a scale and an offset of its own: the meshes are packed as wholes, by their area.
+- All other meshes are unwrapped (`unwrap`).
 
-Unwrapping makes one atlas for the whole scene with one scale (metres a texel): xatlas cuts the charts (`unwrap`), and
-`packing` finds the finest scale for which all fit with `padding` empty texels between them.
+Packing makes one atlas for the whole scene with one scale (metres a texel): the finest for which all fits with
+`padding` empty texels between charts (`packing`). `lightmap.resolution=auto` takes as many texels as
+`lightmap.density` asks for, and as give most of the surface charts of more than a texel or two.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from kiln_schemas.errors import InputError
-from kiln_schemas.settings import LightmapSettings, UvPolicy
-from kiln_workers.scene.geometry import Floats, Ints, face_areas
-from kiln_workers.scene.limits import MAX_COVERAGE
+from kiln_schemas.settings import AUTO, LARGEST_SIDE, LightmapSettings, UvPolicy
+from kiln_schemas.tasks import Placement
+from kiln_workers.scene.charts import gather, points, straightened
+from kiln_workers.scene.geometry import Floats, face_areas
 from kiln_workers.scene.model import Mesh, Scene
-from kiln_workers.scene.packing import Chart, bounding_turn, pack_charts
-from kiln_workers.scene.raster import interior_samples
+from kiln_workers.scene.packing import Layout, fewest_charts, lay_out, lay_out_at, side_for
 from kiln_workers.scene.unwrap import Unwrapped, cut_into_charts
+from kiln_workers.scene.uv_faults import find_faults, uv_areas
 
-UV_TOLERANCE: Final = 1e-4
-OVERSAMPLING: Final = 4
-SAMPLES: Final = (256, 4096)
-"""Bounds of the overlap test's grid side."""
-OVERLAP_TEXELS: Final = 1.0
-FLAT_SHARE: Final = 1e-3
-"""Part of a mesh's area that may have no area in the light map."""
+STEP: Final = 8
+"""A chosen resolution is a multiple of it."""
+FILL: Final = 0.6
+"""Part of an atlas that packed charts fill, about: a first guess."""
+GROWTH: Final = 1.2
+CLEAR_TEXELS: Final = 4.0
+"""A chart of fewer texels along its longer side shows little more than one light."""
+CLEAR_SHARE: Final = 0.75
+"""Part of the surface whose charts `auto` wants larger than that."""
+OWN_RESOLUTION: Final = 128
+"""Resolution at which a mesh's own set is tested, as long as that of the atlas is not known."""
 
 
 @dataclass(frozen=True)
-class Fault:
-    """Why a mesh's light-map UV is not usable."""
+class Lightmap:
+    """A scene with a light-map UV on every mesh, and its light map's size."""
 
-    mesh: str
-    reason: str
+    scene: Scene
+    resolution: int
+    placements: tuple[Placement, ...] = ()
+    """Scale and offset of each mesh whose own set was packed as a whole."""
 
 
 def assign_lightmap_uv(scene: Scene, settings: LightmapSettings) -> Scene:
-    """The scene with a light-map UV on every mesh; notes say per mesh what was done and why."""
+    """The scene with a light-map UV on every mesh (`make_lightmap`)."""
+    return make_lightmap(scene, settings).scene
+
+
+def make_lightmap(scene: Scene, settings: LightmapSettings, *, may_cut: bool = True) -> Lightmap:
+    """A light map for the scene; notes say per mesh what was done and why.
+
+    `may_cut`: whether faces of charts that are longer than the light map may be split. InputError where the charts
+    find no room, or `settings.uv` is `keep` and the scene's own sets cannot be kept.
+    """
     if settings.uv is UvPolicy.UNWRAP:
-        return _unwrapped(scene, settings, {})
-    faults = find_faults(scene.meshes, settings.resolution)
+        return _packed(scene, settings, {mesh.name: "" for mesh in scene.meshes}, may_cut)
+    side = _side_of_kept(scene.meshes, settings)
+    faults = find_faults(scene.meshes, side)
     if not faults:
-        notes = tuple(f"Mesh '{mesh.name}': its own light-map UV is kept." for mesh in scene.meshes)
+        notes = [f"Mesh '{mesh.name}': its own light-map UV is kept." for mesh in scene.meshes]
         kept = tuple(replace(mesh, lightmap_uv=_clipped(mesh)) for mesh in scene.meshes)
-        return replace(scene, meshes=kept, notes=scene.notes + notes)
+        if settings.resolution == AUTO:
+            notes.append(f"Light map: {side} x {side} texels ({_wish(settings)}).")
+        return Lightmap(replace(scene, meshes=kept, notes=(*scene.notes, *notes)), side)
     if settings.uv is UvPolicy.KEEP:
         raise InputError(
             f"its light-map UV (TEXCOORD_1) {faults[0].reason}",
             where=f"mesh '{faults[0].mesh}'",
             remedy="Mend the set, or let it be unwrapped (lightmap.uv=auto).",
         )
-    return _unwrapped(scene, settings, {fault.mesh: fault.reason for fault in faults})
+    reasons = {
+        fault.mesh: f"its own light-map UV {fault.reason}"
+        for mesh in scene.meshes
+        for fault in find_faults([mesh], OWN_RESOLUTION)
+    }
+    return _packed(scene, settings, reasons, may_cut)
 
 
-def find_faults(meshes: Sequence[Mesh], resolution: int) -> list[Fault]:
-    """What keeps the scene's own light-map UVs from being used, at most one fault a mesh."""
-    faults = [fault for mesh in meshes if (fault := _own_fault(mesh)) is not None]
-    if faults:
-        return faults
-    return _overlaps(meshes, resolution)
+def _packed(scene: Scene, settings: LightmapSettings, reasons: dict[str, str], may_cut: bool) -> Lightmap:
+    """All meshes in one atlas: those in `reasons` unwrapped, the others as wholes with their own sets."""
+    unwrapped = iter(cut_into_charts([mesh for mesh in scene.meshes if mesh.name in reasons]))
+    parts = [
+        replace(straightened(next(unwrapped)), whole=not may_cut) if mesh.name in reasons else _as_a_whole(mesh)
+        for mesh in scene.meshes
+    ]
+    layout, why = _sized(scene.meshes, parts, settings)
+    meshes, notes, placements = [], list(scene.notes), []
+    for mesh, whole, part, texels in zip(scene.meshes, parts, layout.parts, layout.uv, strict=True):
+        meshes.append(_split(mesh, part, np.clip(texels / layout.side, 0.0, 1.0)))
+        if mesh.name in reasons:
+            notes.append(_unwrap_note(mesh, whole, part, reasons[mesh.name]))
+        else:
+            placements.append(_placement(mesh, texels / layout.side))
+            notes.append(f"Mesh '{mesh.name}': its own light-map UV is packed as it is, with a scale and an offset.")
+    notes.append(f"Light map: {layout.side} x {layout.side} texels{why}. A texel is {1.0 / layout.scale:.3g} m wide.")
+    if layout.merged:
+        notes.append(
+            f"Light map: {layout.merged} of {sum(part.charts for part in layout.parts)} charts are smaller than a texel"
+            " and share one with a neighbour that faces the same way."
+        )
+    return Lightmap(replace(scene, meshes=tuple(meshes), notes=tuple(notes)), layout.side, tuple(placements))
 
 
-def _own_fault(mesh: Mesh) -> Fault | None:
-    uv = mesh.lightmap_uv
-    if uv is None:
-        return Fault(mesh.name, "is missing")
-    outside = ((uv < -UV_TOLERANCE) | (uv > 1.0 + UV_TOLERANCE)).any(axis=1)
-    if outside.any():
-        vertex = int(np.argmax(outside))
-        return Fault(mesh.name, f"leaves [0, 1] at vertex {vertex} ({uv[vertex, 0]:.4g}, {uv[vertex, 1]:.4g})")
-    area = face_areas(mesh.positions, mesh.faces)
-    flat = _uv_areas(mesh) < 1e-12
-    if area[flat].sum() > FLAT_SHARE * area.sum():
-        return Fault(mesh.name, f"has {int(flat.sum())} faces without area")
-    return None
+def _unwrap_note(mesh: Mesh, whole: Unwrapped, part: Unwrapped, reason: str) -> str:
+    charts = f"{whole.charts} chart{'s' if whole.charts > 1 else ''}"
+    cuts = f", long ones cut into {part.charts} pieces" if part.charts > whole.charts else ""
+    loose = (
+        f"; {whole.loose} faces have a chart each, as they could not be flattened with others" if whole.loose else ""
+    )
+    return f"Mesh '{mesh.name}': unwrapped into {charts}{cuts} ({reason or 'as asked'}){loose}."
 
 
-def _overlaps(meshes: Sequence[Mesh], resolution: int) -> list[Fault]:
-    areas = [float(_uv_areas(mesh).sum()) for mesh in meshes]
-    if sum(areas) > MAX_COVERAGE:
-        most = meshes[int(np.argmax(areas))]
-        return [Fault(most.name, f"overlaps: all meshes' together cover the light map {sum(areas):.0f} times over")]
-    size = int(np.clip(OVERSAMPLING * resolution, *SAMPLES))
-    corners = np.concatenate([_uv_corners(mesh) for mesh in meshes]) * size
-    mesh_of = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
-    owner = np.full(size * size, -1, dtype=np.int64)
-    shared: dict[tuple[int, int], int] = {}
-    for face, sample in interior_samples(corners, size, margin=0.1):
-        # Within a batch, all but the first face at a sample overlap it; then compare with earlier batches.
-        order = np.argsort(sample, kind="stable")
-        face, sample = face[order], sample[order]
-        repeated = np.concatenate([[False], sample[1:] == sample[:-1]])
-        taken = owner[sample] >= 0
-        previous = np.where(taken, owner[sample], np.concatenate([face[:1], face[:-1]]))
-        clash = repeated | taken
-        pairs, counts = np.unique(mesh_of[previous[clash]] * len(meshes) + mesh_of[face[clash]], return_counts=True)
-        for pair, count in zip(pairs.tolist(), counts.tolist(), strict=True):
-            a, b = sorted(divmod(pair, len(meshes)))
-            shared[a, b] = shared.get((a, b), 0) + count
-        owner[sample[~clash]] = face[~clash]
-    texels = {key: count * (resolution / size) ** 2 for key, count in shared.items()}
-    if sum(texels.values()) <= OVERLAP_TEXELS:
-        return []
-    faults: dict[int, Fault] = {}
-    for (a, b), area in sorted(texels.items(), key=lambda item: -item[1]):
-        other = "itself" if a == b else f"mesh '{meshes[a].name}'"
-        faults.setdefault(b, Fault(meshes[b].name, f"overlaps {other} over {area:.3g} texels"))
-    return list(faults.values())
+def _sized(meshes: Sequence[Mesh], parts: Sequence[Unwrapped], settings: LightmapSettings) -> tuple[Layout, str]:
+    """The layout at the resolution that is asked for, or at a chosen one and why it was chosen."""
+    if settings.resolution != AUTO:
+        layout = lay_out(meshes, parts, settings.resolution, settings.padding)
+        if layout is None:
+            count = fewest_charts(meshes, parts)
+            raise _too_small(settings.resolution, count, settings.padding, "Raise lightmap.resolution")
+        return layout, ""
+    pieces = gather(meshes, parts)
+    order = np.argsort(pieces.extent.max(axis=1), kind="stable")
+    covered = np.cumsum(pieces.area[order])
+    small = int(np.searchsorted(covered, (1.0 - CLEAR_SHARE) * covered[-1]))
+    clear = CLEAR_TEXELS / float(pieces.extent[order[min(small, len(order) - 1)]].max())
+    scale = max(settings.density, clear)
+    side = _rounded(scale * math.sqrt(covered[-1] / FILL), settings)
+    while side < settings.most and lay_out_at(meshes, parts, side, settings.padding, scale) is None:
+        side = min(_rounded(side * GROWTH, settings), settings.most)
+    layout = lay_out(meshes, parts, side, settings.padding)
+    why = _wish(settings, f"; {len(order)} charts want {clear:.3g}" if clear > settings.density else "")
+    if layout is None:
+        count = fewest_charts(meshes, parts)
+        side = side_for(count, settings.padding)
+        why = f"more than lightmap.most, {settings.most}, as {count} charts need them"
+        if side <= LARGEST_SIDE:
+            side = min(STEP * math.ceil(side / STEP), LARGEST_SIDE)
+            layout = lay_out(meshes, parts, side, settings.padding)
+        if layout is None:
+            raise _too_small(LARGEST_SIDE, count, settings.padding, "Join objects")
+    return layout, f" ({why})"
 
 
-def _unwrapped(scene: Scene, settings: LightmapSettings, reasons: dict[str, str]) -> Scene:
-    parts = cut_into_charts(scene.meshes)
-    counts = [int(part.chart.max()) + 1 for part in parts]
-    room = (settings.resolution + settings.padding) ** 2 // (1 + settings.padding) ** 2
-    if sum(counts) > room:
-        raise _too_many_charts(sum(counts), settings)
-    flat = [piece for part in parts for piece in _flat_pieces(part)]
-    packed = pack_charts([piece.chart for piece in flat], settings.resolution, settings.padding)
-    if packed is None:
-        raise _too_many_charts(len(flat), settings)
-    scale, places = packed
-    meshes, notes, done = [], [], 0
-    for mesh, part, count in zip(scene.meshes, parts, counts, strict=True):
-        uv = np.zeros((len(part.vertex), 2))
-        for piece, place in zip(flat[done : done + count], places[done : done + count], strict=True):
-            uv[piece.vertices] = (piece.uv[:, ::-1] if place.turned else piece.uv) * scale + place.origin
-        done += count
-        meshes.append(_split(mesh, part, np.clip(uv / settings.resolution, 0.0, 1.0)))
-        default = "another mesh has to be" if reasons else "as asked"
-        why = f"its own light-map UV {reasons[mesh.name]}" if mesh.name in reasons else default
-        notes.append(f"Mesh '{mesh.name}': unwrapped into {count} chart{'s' if count > 1 else ''} ({why}).")
-    notes.append(f"Light map: a texel is {1.0 / scale:.3g} m wide.")
-    return replace(scene, meshes=tuple(meshes), notes=(*scene.notes, *notes))
+def _wish(settings: LightmapSettings, more: str = "") -> str:
+    bounds = f"between {settings.least} and {settings.most}"
+    return f"lightmap.resolution=auto, {bounds}: {settings.density:g} texels a metre are aimed at{more}"
 
 
-def _too_many_charts(count: int, settings: LightmapSettings) -> InputError:
+def _rounded(side: float, settings: LightmapSettings) -> int:
+    """The next multiple of STEP, within the bounds of `auto`."""
+    within = min(max(side, settings.least), settings.most)
+    return min(max(STEP * math.ceil(within / STEP), settings.least), settings.most)
+
+
+def _side_of_kept(meshes: Sequence[Mesh], settings: LightmapSettings) -> int:
+    """The resolution with the scene's own sets: at `auto` texels of the wanted size, all faces taken together."""
+    if settings.resolution != AUTO:
+        return settings.resolution
+    area = sum(float(face_areas(mesh.positions, mesh.faces).sum()) for mesh in meshes)
+    flat = sum(float(uv_areas(mesh).sum()) for mesh in meshes if mesh.lightmap_uv is not None)
+    return _rounded(settings.density * math.sqrt(area / flat) if flat > 0.0 else settings.least, settings)
+
+
+def _too_small(side: int, charts: int, padding: int, remedy: str) -> InputError:
+    need = side_for(charts, padding)
     return InputError(
-        f"{count} charts with {settings.padding} texels between them do not fit into"
-        f" {settings.resolution} x {settings.resolution} texels",
+        f"{charts} charts with {padding} texels between them need {need} x {need} texels, the light map has"
+        f" {side} x {side}",
         where="lightmap.resolution",
-        remedy="Raise lightmap.resolution, or give the scene a light-map UV with fewer charts.",
+        remedy=f"{remedy}, set lightmap.resolution=auto, or give the scene a light-map UV with fewer charts.",
     )
 
 
-@dataclass(frozen=True)
-class _Piece:
-    """A chart with the vertices of the cut mesh that it holds."""
+def _as_a_whole(mesh: Mesh) -> Unwrapped:
+    """The mesh with its own set as one chart that is neither turned nor cut, true to scale on the whole."""
+    assert mesh.lightmap_uv is not None
+    uv = _clipped(mesh).astype(np.float64)
+    uv = uv - uv.min(axis=0)
+    area = float(face_areas(mesh.positions, mesh.faces).sum())
+    vertex = np.arange(len(mesh.positions))
+    return Unwrapped(
+        vertex=vertex,
+        faces=mesh.faces.astype(np.int64),
+        uv=uv * math.sqrt(area / float(uv_areas(mesh).sum())),
+        chart=np.zeros(len(vertex), dtype=np.int64),
+        other=vertex,
+        share=np.zeros(len(vertex)),
+        rigid=True,
+        whole=True,
+    )
 
-    vertices: Ints
-    uv: Floats  # [len(vertices), 2] metres, lower bounds at 0, turned to the smallest bounding box
-    chart: Chart
 
-
-def _flat_pieces(part: Unwrapped) -> list[_Piece]:
-    face_chart = part.chart[part.faces[:, 0]]
-    pieces = []
-    for number in range(int(part.chart.max()) + 1):
-        vertices = np.flatnonzero(part.chart == number)
-        uv = part.uv[vertices] @ bounding_turn(part.uv[vertices]).T
-        uv -= uv.min(axis=0)
-        local = np.searchsorted(vertices, part.faces[face_chart == number])
-        pieces.append(_Piece(vertices, uv, Chart(uv[local])))
-    return pieces
+def _placement(mesh: Mesh, uv: Floats) -> Placement:
+    """From the mesh's own set to the light map: uv' = uv * scale + offset."""
+    assert mesh.lightmap_uv is not None
+    own = _clipped(mesh).astype(np.float64)
+    axis = int(np.argmax(np.ptp(own, axis=0)))
+    scale = float(np.ptp(uv, axis=0)[axis] / np.ptp(own, axis=0)[axis])
+    offset = uv.min(axis=0) - scale * own.min(axis=0)
+    return Placement(mesh=mesh.name, scale=scale, offset=(float(offset[0]), float(offset[1])))
 
 
 def _split(mesh: Mesh, part: Unwrapped, lightmap_uv: Floats) -> Mesh:
-    return replace(
-        mesh,
-        positions=mesh.positions[part.vertex],
-        normals=mesh.normals[part.vertex],
-        faces=part.faces.astype(np.int32),
-        uv=None if mesh.uv is None else mesh.uv[part.vertex],
-        lightmap_uv=lightmap_uv.astype(np.float32),
-    )
+    """The mesh with the part's vertices: every array of the old vertices is taken over, interpolated on cuts."""
+    count = len(mesh.positions)
+    values = {item.name: getattr(mesh, item.name) for item in fields(mesh)}
+    taken: dict[str, Any] = {
+        name: points(value, part).astype(value.dtype)
+        for name, value in values.items()
+        if name != "faces" and isinstance(value, np.ndarray) and len(value) == count
+    }
+    length = np.linalg.norm(taken["normals"], axis=1, keepdims=True)
+    between = (part.share > 0.0)[:, None] & (length > 1e-12)
+    taken["normals"] = np.where(between, taken["normals"] / np.maximum(length, 1e-12), taken["normals"])
+    taken |= {"faces": part.faces.astype(np.int32), "lightmap_uv": lightmap_uv.astype(np.float32)}
+    return replace(mesh, **taken)
 
 
 def _clipped(mesh: Mesh) -> npt.NDArray[np.float32]:
     assert mesh.lightmap_uv is not None
     return np.clip(mesh.lightmap_uv, 0.0, 1.0)
-
-
-def _uv_corners(mesh: Mesh) -> Floats:
-    assert mesh.lightmap_uv is not None
-    return mesh.lightmap_uv.astype(np.float64)[mesh.faces]
-
-
-def _uv_areas(mesh: Mesh) -> Floats:
-    a, b, c = np.moveaxis(_uv_corners(mesh), 1, 0)
-    return np.asarray(0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]))

@@ -36,10 +36,9 @@ def touched_squares(corners: Floats, width: int, height: int) -> Touched:
     best_distance = np.full(width * height, np.inf)
     best_face = np.full(width * height, -1, dtype=np.int64)
     best_barycentric = np.zeros((width * height, 3))
-    for face, column, row in _squares(corners, width, height):
-        keep = _overlaps_square(corners[face], column, row)
-        face, square = face[keep], row[keep] * width + column[keep]
-        centre = np.stack([column[keep] + 0.5, row[keep] + 0.5], axis=1)
+    for face, column, row in touching_squares(corners, width, height):
+        square = row * width + column
+        centre = np.stack([column + 0.5, row + 0.5], axis=1)
         barycentric, distance = closest_point(corners[face], centre)
         order = np.lexsort((face, distance, square))
         first = order[np.unique(square[order], return_index=True)[1]]
@@ -49,6 +48,13 @@ def touched_squares(corners: Floats, width: int, height: int) -> Touched:
         best_barycentric[square[better]] = barycentric[better]
     square = np.flatnonzero(best_face >= 0)
     return Touched(square, best_face[square], best_barycentric[square], best_distance[square])
+
+
+def touching_squares(corners: Floats, width: int, height: int) -> Iterator[tuple[Ints, Ints, Ints]]:
+    """(triangle, column, row) for every square that a triangle of `corners` [F, 3, 2] touches, in batches."""
+    for face, column, row in _squares(corners, width, height):
+        keep = _overlaps_square(corners[face], column, row)
+        yield face[keep], column[keep], row[keep]
 
 
 def closest_point(corners: Floats, point: Floats) -> tuple[Floats, Floats]:

@@ -30,6 +30,7 @@ from kiln_schemas.conventions import (
 from kiln_schemas.errors import InputError, NotFound, TooLarge
 from kiln_schemas.files import open_regular, read_small
 from kiln_schemas.manifest import Manifest
+from kiln_schemas.settings import AUTO, LARGEST_SIDE
 from kiln_workers.package import ktx2
 from kiln_workers.package.half import layers_to_lobes
 from kiln_workers.scene.gltf import read_gltf
@@ -188,8 +189,11 @@ def _refuse_larger(header: Mapping[str, Any], path: Path, most_texels: int) -> N
 
 
 def _texels(manifest: Manifest) -> int:
-    """Texels of the light map."""
-    return manifest.settings.lightmap.resolution**2
+    """Texels of the light map, at most."""
+    lightmap, width = manifest.settings.lightmap, manifest.lightmap.get("width")
+    if lightmap.resolution == AUTO and not isinstance(width, int):
+        raise InputError("does not say how wide the light map is", where=MANIFEST_JSON, remedy="Bake it again.")
+    return min(lightmap.side(width), LARGEST_SIDE) ** 2
 
 
 def _lobes(folder: Path, name: str, manifest: Manifest, device: torch.device) -> Tensor:

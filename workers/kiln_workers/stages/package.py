@@ -49,7 +49,7 @@ engines show it behind the scene."""
 
 TEXELS_AT_ONCE: Final = 256
 
-LIBRARIES: Final = ("mitsuba", "drjit", "torch", "numpy", "tensorstore", "OpenEXR", "OpenImageIO", "xatlas")
+LIBRARIES: Final = ("mitsuba", "drjit", "torch", "numpy", "tensorstore", "OpenEXR", "OpenImageIO", "uvunwrap")
 
 
 def run(payload: PackagePayload, context: Context) -> PackageResult:

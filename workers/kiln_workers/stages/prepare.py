@@ -12,7 +12,7 @@ from kiln_schemas.tasks import MOST_NOTES, MOST_TILES, Bundle, PreparePayload, P
 from kiln_workers.render.between import between_maps
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import pack_scene, scene_hash
-from kiln_workers.scene.atlas import assign_lightmap_uv
+from kiln_workers.scene.atlas import make_lightmap
 from kiln_workers.scene.limits import LAYOUT_S, deadline
 from kiln_workers.scene.load import check_light, load_scene
 from kiln_workers.scene.model import Scene
@@ -46,9 +46,10 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
     scene = check_light(load_scene(folder, bundle.entry, bundle.environment))
     step(2)
     with deadline(LAYOUT_S, bundle.entry, "give a light map", "Simplify it, or give it a light-map UV (TEXCOORD_1)."):
-        scene = assign_lightmap_uv(scene, settings.lightmap)
+        lightmap = make_lightmap(scene, settings.lightmap)
+        scene = lightmap.scene
         step(3)
-        texel_map = build_texel_map(scene, settings.lightmap.resolution)
+        texel_map = build_texel_map(scene, lightmap.resolution)
     tiles = plan_tiles(texel_map, settings.lightmap.tile)
     if not tiles:
         raise InputError(
@@ -73,6 +74,8 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         texel_map=context.put_blob(pack_texel_map(texel_map)),
         between=tuple(context.put_blob(pack_texel_map(moved)) for moved in between),
         scene_hash=digest,
+        resolution=lightmap.resolution,
+        placements=lightmap.placements,
         tiles=tiles,
         has_environment=scene.environment is not None,
         has_light=scene.has_light,
@@ -108,7 +111,7 @@ def _lay_out(bundle: Bundle, context: Context) -> Path:
 def _create_store(url: str, scene: Scene, texel_map: TexelMap, digest: str, settings: BakeSettings) -> None:
     store = LightFieldStore.create(
         url,
-        shape=(settings.lightmap.resolution, settings.lightmap.resolution),
+        shape=(texel_map.state.shape[0], texel_map.state.shape[1]),
         image_size=settings.render.image_size,
         tile=settings.lightmap.tile,
         functions=[Function.LIGHT_FIELD] + ([Function.VISIBILITY] if scene.environment else []),

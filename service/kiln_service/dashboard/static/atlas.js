@@ -83,7 +83,7 @@ export class Atlas {
   async update() {
     const reply = await fetch(`/v1/jobs/${this.job}/tiles`);
     if (!reply.ok) return;
-    const { resolution, tile, states } = this.canvas.dataset;
+    const { tile, states } = this.canvas.dataset, resolution = reply.headers.get("X-Texels");
     const side = Number(reply.headers.get("X-Side")), size = Number(tile), tiles = [];
     new Uint8Array(await reply.arrayBuffer()).forEach((code, cell) => {
       if (code) tiles.push([size * Math.floor(cell / side), size * (cell % side), size, code - 1]);

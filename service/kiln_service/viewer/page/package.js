@@ -6,6 +6,7 @@ import { GLTFLoader } from "../vendor/three/GLTFLoader.js";
 const SHADERS = ["sg.glsl", "environment.glsl", "lightkiln.glsl", "surface.vert.glsl", "surface.frag.glsl"];
 const TEXTURES = ["lightfield.ktx2", "visibility.ktx2", "irradiance.ktx2", "environment_u.ktx2", "environment_ggx.ktx2"];
 const FORMAT_VERSION = 1;
+const LARGEST_SIDE = 8192; // texels, of kiln_schemas.settings
 
 // What can be wrong with a package, in a sentence for people.
 export class PackageError extends Error {}
@@ -61,7 +62,7 @@ async function readTextures(folder, names, manifest, part) {
     const entries = names.map(async (name) => {
       const texture = new Promise((resolve, reject) => waiting.set(name, { resolve, reject }));
       const described = manifest.textures[name];
-      checkSize(name, described, manifest.settings);
+      checkSize(name, described, manifest);
       worker.postMessage({ name, url: new URL(folder + name, location.href).href, described });
       return [name, await part(texture)];
     });
@@ -72,15 +73,20 @@ async function readTextures(folder, names, manifest, part) {
 }
 
 // What the manifest says of a texture has to fit the settings of the bake, which bound what is inflated.
-function checkSize(name, { width, height, layers, faces }, settings) {
+function checkSize(name, { width, height, layers, faces }, { settings, lightmap }) {
   const environment = name.startsWith("environment_");
-  const side = environment ? settings.package.environment_size : settings.lightmap.resolution;
+  const side = environment ? settings.package.environment_size : lightMapSide(settings.lightmap, lightmap);
   const most = { width: side, height: side, layers: environment ? 64 : 2 * settings.fit.lobes, faces: 6 };
   for (const [key, value] of Object.entries({ width, height, layers, faces })) {
     if (!Number.isInteger(value) || value < 1 || value > most[key]) {
       throw new PackageError(`${name} has ${value} as its ${key}; the settings of the bake allow 1 to ${most[key]}.`);
     }
   }
+}
+
+// Texels along each side of the light map: the number in the settings, or at `auto` what the bake chose.
+function lightMapSide({ resolution }, { width }) {
+  return resolution === "auto" ? Math.min(width, LARGEST_SIDE) : resolution;
 }
 
 function upload({ width, height, layers, faces, levels }, name) {
