@@ -11,10 +11,12 @@ from kiln_schemas.settings import BakeSettings
 from kiln_schemas.tasks import (
     MOST_FILES,
     MOST_NOTES,
+    MOST_PLACEMENTS,
     Artifact,
     BundlePath,
     EnvironmentRef,
     FitMetrics,
+    Placement,
     Sha256,
 )
 from kiln_schemas.text import Note, Told
@@ -66,7 +68,10 @@ class Manifest(Contract):
     """Per KTX2 file: width, height, layers, lobes, channel meanings, `normalised` for environment_u; `environment.exr`
     with its projection and orientation."""
     lightmap: Figures
-    """Resolution, texels covered, valid, invalid, charts, worst texel size in metres."""
+    """Resolution, texels covered, valid, invalid, charts, `speck_share` (the part of the covered texels that lies in
+    charts of four texels or fewer), worst texel size in metres."""
+    placements: tuple[Placement, ...] = Field(default=(), max_length=MOST_PLACEMENTS)
+    """Scale and offset of the meshes whose own light-map UV was packed as a whole."""
     stage_seconds: dict[Name, Seconds] = Field(max_length=16)
     overflows: Count
     versions: dict[Name, Name] = Field(max_length=64)

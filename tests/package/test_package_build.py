@@ -75,6 +75,8 @@ def test_the_manifest_says_what_was_baked_and_how_well(make_sample, tmp_path: Pa
     assert manifest["lightmap"]["valid"] == int((state == 1).sum())
     assert manifest["lightmap"]["invalid_texels"] == np.flatnonzero(state == 2).tolist()
     assert manifest["lightmap"]["charts"] == 2
+    assert manifest["lightmap"]["speck_share"] == 0.0
+    assert manifest["placements"] == [{"mesh": "room", "scale": 0.5, "offset": [0.25, 0.0]}]
     assert manifest["textures"]["environment_u.ktx2"]["alphas"] == [0.04, 0.25, 1.0]
     assert manifest["textures"]["environment_u.ktx2"]["lobe_integrals"] == [3.9, 3.1, 1.5]
     assert manifest["textures"]["environment_u.ktx2"]["normalised"] is False

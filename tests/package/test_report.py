@@ -17,6 +17,7 @@ from kiln_workers.package import charts, report
 from kiln_workers.package.build import build_package
 from kiln_workers.package.gates import Judgement, View
 from kiln_workers.package.preview import choose_texels
+from kiln_workers.scene.texel_map import speck_share
 
 
 class Page(HTMLParser):
@@ -183,3 +184,19 @@ def test_numbers_are_short(value: float, text: str) -> None:
 @pytest.mark.parametrize(("value", "word"), [(0.01, "excellent"), (0.149, "good"), (0.3, "poor"), (0.7, "failed")])
 def test_the_verdict_follows_the_relative_error(value: float, word: str) -> None:
     assert report.grade(value)[0] == word
+
+
+def test_a_light_map_of_specks_is_not_called_good(make_sample, tmp_path: Path) -> None:
+    sample = make_sample()
+    assert speck_share(sample.texel_map.chart) == 0.0
+    covered = sample.texel_map.chart >= 0
+    sample.texel_map.chart[covered] = np.arange(int(covered.sum())) // 2  # charts of two texels
+    text, page = built(tmp_path, sample)
+    assert "light map too coarse" in text and not re.search(r": (excellent|very good|good)</h3>", text)
+    assert "texels in charts of four or fewer 100 %" in re.sub(r"\s+", " ", "".join(page.text))
+
+
+@pytest.mark.parametrize(("specks", "word"), [(0.0, "very good"), (0.5, "very good"), (0.51, "light map too coarse")])
+def test_the_grade_of_a_coarse_light_map(specks: float, word: str) -> None:
+    assert report.grade(0.03, specks)[0] == word
+    assert report.grade(0.4, specks)[0] == "poor"

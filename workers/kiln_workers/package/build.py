@@ -40,6 +40,7 @@ from kiln_workers.package.half import lobes_to_layers, to_half
 from kiln_workers.package.preview import PackagePreview
 from kiln_workers.package.seams import Stitcher
 from kiln_workers.scene.model import Scene
+from kiln_workers.scene.texel_map import speck_share
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
@@ -310,6 +311,7 @@ def _manifest(package: _Package) -> Manifest:
         left_out=_left_out(given),
         textures=package.textures,
         lightmap=_lightmap(given.texel_map),
+        placements=payload.prepare.placements,
         stage_seconds={name: round(seconds, 3) for name, seconds in given.stage_seconds.items()},
         overflows=sum(render.overflows for render in payload.renders) + package.clamped,
         versions=dict(given.versions),
@@ -342,5 +344,6 @@ def _lightmap(texel_map: TexelMapLike) -> dict[str, Any]:
         "invalid": int((covered & ~valid).sum()),
         "charts": int(np.unique(chart[chart >= 0]).size),
         "invalid_texels": np.flatnonzero(covered & ~valid).tolist(),  # row * width + column
+        "speck_share": speck_share(chart),
         "worst_texel_size_m": float(texel_map.texel_size[covered].max()),
     }

@@ -19,6 +19,7 @@ from kiln_schemas.tasks import Artifact, FitMetrics, FitResult
 from kiln_workers.package import charts, colour
 from kiln_workers.package.gates import View
 from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelPreview
+from kiln_workers.scene.texel_map import COARSE
 from kiln_workers.sphere import octahedral
 
 Float32 = npt.NDArray[np.float32]
@@ -61,7 +62,9 @@ def render(report: ReportInput) -> bytes:
     fits = {fit.function: fit for fit in report.fits}
     manifest = report.manifest
     functions = [
-        _function_view(function, metrics, fits[function], report.preview.functions.get(function))
+        _function_view(
+            function, metrics, fits[function], report.preview.functions.get(function), manifest.lightmap["speck_share"]
+        )
         for function, metrics in _present(manifest)
     ]
     html = environment.from_string(template).render(
@@ -81,8 +84,13 @@ def render(report: ReportInput) -> bytes:
     return html.encode("utf-8")
 
 
-def grade(log_mse_rel: float) -> tuple[str, str]:
-    """A word for a relative error and the style that shows it."""
+def grade(log_mse_rel: float, speck_share: float = 0.0) -> tuple[str, str]:
+    """A word for a relative error and the style that shows it.
+
+    Lobes may fit each texel well and the bake still be poor: no light map that consists of specks is called good.
+    """
+    if speck_share > COARSE and log_mse_rel < _GRADES[3][0]:
+        return "light map too coarse", "poor"
     return next(((word, style) for bound, word, style in _GRADES if log_mse_rel < bound), ("failed", "poor"))
 
 
@@ -117,10 +125,10 @@ def _present(manifest: Manifest) -> list[tuple[Function, FitMetrics]]:
 
 
 def _function_view(
-    function: Function, metrics: FitMetrics, fit: FitResult, preview: FunctionPreview | None
+    function: Function, metrics: FitMetrics, fit: FitResult, preview: FunctionPreview | None, specks: float
 ) -> dict[str, Any]:
     """What the template shows about one function."""
-    word, style = grade(metrics.log_mse_rel) if metrics.signal else ("nothing to fit", "fair")
+    word, style = grade(metrics.log_mse_rel, specks) if metrics.signal else ("nothing to fit", "fair")
     view: dict[str, Any] = {
         "title": _TITLES[function],
         "meaning": _MEANINGS[function],

@@ -46,6 +46,18 @@ class TexelMap:
         return int((self.state != TexelState.GUTTER).sum())
 
 
+SPECK: Final = 4
+"""A chart of so many texels or fewer shows one light, not how light changes over it."""
+COARSE: Final = 0.5
+"""A light map is too coarse where more than this part of its texels lies in specks."""
+
+
+def speck_share(chart: npt.NDArray[np.int32]) -> float:
+    """The part of the covered texels of `chart` [H, W] (-1: gutter) that lies in charts of at most SPECK texels."""
+    counts = np.unique(chart[chart >= 0], return_counts=True)[1]
+    return float(counts[counts <= SPECK].sum() / max(counts.sum(), 1))
+
+
 _LAYOUT: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
     "state": ("|u1", ()),
     "position": ("<f4", (3,)),

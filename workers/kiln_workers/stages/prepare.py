@@ -16,7 +16,7 @@ from kiln_workers.scene.atlas import make_lightmap
 from kiln_workers.scene.limits import LAYOUT_S, deadline
 from kiln_workers.scene.load import check_light, load_scene
 from kiln_workers.scene.model import Scene
-from kiln_workers.scene.texel_map import TexelMap, pack_texel_map
+from kiln_workers.scene.texel_map import COARSE, SPECK, TexelMap, pack_texel_map, speck_share
 from kiln_workers.scene.texels import build_texel_map
 from kiln_workers.stages.tiles import plan_tiles
 from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
@@ -75,12 +75,12 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         between=tuple(context.put_blob(pack_texel_map(moved)) for moved in between),
         scene_hash=digest,
         resolution=lightmap.resolution,
-        placements=lightmap.placements,
+        placements=lightmap.placements[:MOST_PLACEMENTS],
         tiles=tiles,
         has_environment=scene.environment is not None,
         has_light=scene.has_light,
         triangles=scene.triangles,
-        notes=few_notes(scene.notes),
+        notes=few_notes((*_coarse_note(texel_map), *scene.notes)),
         seconds=time.perf_counter() - began,
     )
 
@@ -96,6 +96,16 @@ def few_notes(notes: Sequence[str]) -> tuple[str, ...]:
         return tuple(notes)
     kept = MOST_NOTES - 1
     return (*notes[:kept], f"{len(notes) - kept} more notes are left out.")
+
+
+def _coarse_note(texel_map: TexelMap) -> list[str]:
+    share = speck_share(texel_map.chart)
+    if share <= COARSE:
+        return []
+    return [
+        f"Light map: too coarse for this scene. {100 * share:.0f} % of its texels lie in charts of {SPECK} texels or"
+        " fewer, where light cannot change. Raise lightmap.resolution or lightmap.most."
+    ]
 
 
 def _lay_out(bundle: Bundle, context: Context) -> Path:
