@@ -8,7 +8,7 @@ from typing import Final
 from kiln_schemas.errors import InputError, TooLarge
 from kiln_schemas.job import check_bundle
 from kiln_schemas.settings import BakeSettings, Function, Solver
-from kiln_schemas.tasks import MOST_NOTES, MOST_TILES, Bundle, PreparePayload, PrepareResult
+from kiln_schemas.tasks import MOST_NOTES, MOST_PLACEMENTS, MOST_TILES, Bundle, PreparePayload, PrepareResult
 from kiln_workers.render.between import between_maps
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import pack_scene, scene_hash
