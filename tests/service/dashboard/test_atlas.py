@@ -129,7 +129,7 @@ def test_what_makes_no_sense_is_refused(home, job):
         "irradiance?tile=0,0&stride=3": 422,
         "irradiance?" + "&".join(["tile=0,0"] * 300): 422,
         "texels?stride=0": 422,
-        "texels/32/0": 422,
+        "texels/32/0": 404,
         "texels/99999/0": 422,
         "tiles/0/1": 404,
         "do/explode": 405,
