@@ -1,7 +1,8 @@
-"""Charts between the unwrapper and the packer: laid straight, cut where they are too long, as pieces to be packed.
+"""Charts between the unwrapper and the packer: laid straight, slimmed and cut where they are too long, as pieces.
 
-A kerb of 400 m beside a room would else decide the scale of the whole light map. Its chart is cut across into pieces
-that fit; the faces on a cut are split there, the same way on both sides.
+A kerb of 400 m beside a room would else decide the scale of the whole light map, or take most of its texels. Its chart
+gets a lower scale of its own and is cut across into pieces that fit; the faces on a cut are split there, the same way
+on both sides.
 """
 
 from collections.abc import Sequence
@@ -15,6 +16,8 @@ from kiln_workers.scene.geometry import Floats, Ints
 from kiln_workers.scene.model import Mesh
 from kiln_workers.scene.unwrap import Unwrapped
 
+LONG_SHARE: Final = 0.125
+"""Part of the light map that a chart longer than its side may take."""
 ANGLES: Final = 64
 """Angles within a quarter turn at which a chart's bounding box is tried."""
 
@@ -52,6 +55,27 @@ def straightened(part: Unwrapped) -> Unwrapped:
     out = np.zeros_like(uv)
     out[order] = np.stack([cosine * uv[:, 0] + sine * uv[:, 1], -sine * uv[:, 0] + cosine * uv[:, 1]], axis=1)
     return replace(part, uv=out - _bounds(out, part.chart, part.charts)[0][part.chart])
+
+
+def slimmed(part: Unwrapped, scale: float, side: float, padding: int) -> Unwrapped:
+    """The part with long charts made smaller, so that none takes the whole of a light map of `side` texels.
+
+    A chart longer than the side is drawn at a scale of its own, lower than `scale` texels a metre, at which its texels
+    and the padding beside them are LONG_SHARE of the light map: length s (width s + 1 + padding) = share. A chart that
+    may not be cut is made as long as the side instead.
+    """
+    low, high = _bounds(part.uv, part.chart, part.charts)
+    length, width = (high - low).max(axis=1), (high - low).min(axis=1)
+    long = length * scale > side
+    if not long.any():
+        return part
+    room, rows = LONG_SHARE * side * side, 1.0 + padding
+    square = np.maximum(length * width, 1e-300)
+    own = (np.sqrt((length * rows) ** 2 + 4.0 * square * room) - length * rows) / (2.0 * square)
+    own = np.where(own * width < 1e-6, room / np.maximum(length * rows, 1e-300), own)
+    own = side / np.maximum(length, 1e-300) if part.whole else np.maximum(own, side / np.maximum(length, 1e-300))
+    factor = np.where(long, np.minimum(own / scale, 1.0), 1.0)
+    return replace(part, uv=part.uv * factor[part.chart][:, None])
 
 
 def cut_long(part: Unwrapped, longest: float) -> Unwrapped:

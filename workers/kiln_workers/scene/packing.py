@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import binary_dilation
 
-from kiln_workers.scene.charts import Pieces, cut_long, gather
+from kiln_workers.scene.charts import Pieces, cut_long, gather, slimmed
 from kiln_workers.scene.geometry import Floats, Ints
 from kiln_workers.scene.model import Mesh
 from kiln_workers.scene.raster import touching_squares
@@ -74,7 +74,8 @@ def lay_out_at(
     meshes: Sequence[Mesh], parts: Sequence[Unwrapped], side: int, padding: int, scale: float
 ) -> Layout | None:
     """The layout with `scale` texels a metre; None if the charts do not fit."""
-    cut = [cut_long(part, (side - 2.0 * ROUNDING) / scale) for part in parts]
+    room = side - 2.0 * ROUNDING
+    cut = [cut_long(slimmed(part, scale, room, padding), room / scale * (1.0 + 1e-9)) for part in parts]
     pieces = gather(meshes, cut)
     group = _groups(pieces, scale)
     placed = _place_all(pieces, group, side, padding, scale)
