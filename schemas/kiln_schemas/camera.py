@@ -13,7 +13,7 @@ from kiln_schemas.base import Contract
 from kiln_schemas.errors import InputError
 from kiln_schemas.files import read_small
 
-Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Coordinate = Annotated[float, Field(ge=-1e7, le=1e7)]
 Triple = tuple[Coordinate, Coordinate, Coordinate]
 CameraName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
 """Also part of a file's name, so of the same characters as an artifact's."""

@@ -11,7 +11,7 @@ from kiln_schemas.errors import MachineLacks
 from kiln_workers.render.tile import BYTES_PER_LANE, SMALLEST_WAVEFRONT, TexelBatch, TileImages, TileRenderer
 from kiln_workers.scene.model import Environment, Scene
 
-ARRAYS = ("light_field", "visibility", "irradiance", "back_faces")
+ARRAYS = ("light_field", "visibility", "irradiance", "enclosed")
 
 
 def subset(texels: TexelBatch, order: np.ndarray) -> TexelBatch:

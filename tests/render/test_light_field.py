@@ -122,20 +122,6 @@ def test_values_beyond_fp16_are_clamped_and_counted(
     assert np.isfinite(result.light_field).all() and not clamped[..., 1].any()
 
 
-@pytest.mark.parametrize(("double_sided", "fraction"), [(False, 1.0), (True, 0.0)])
-def test_back_faces_are_counted(
-    quad: Callable[..., Mesh],
-    texels: Callable[..., TexelBatch],
-    renderer: Callable[..., TileRenderer],
-    double_sided: bool,
-    fraction: float,
-) -> None:
-    """A texel under a huge floor that faces up sees its back, unless the material has no back."""
-    scene = Scene((quad((-1e4, 0.1, -1e4), (0, 0, 2e4), (2e4, 0, 0)),), (Material("m", double_sided=double_sided),))
-    back = renderer(scene).render(texels([(0.0, 0.0, 0.0)])).back_faces[0]
-    assert back == pytest.approx(fraction, abs=1e-3)
-
-
 def test_a_mirrored_scene_gives_the_mirrored_field(
     cornell: Callable[..., Scene], texels: Callable[..., TexelBatch], renderer: Callable[..., TileRenderer]
 ) -> None:

@@ -25,7 +25,6 @@ from kiln_workers.fit.source import ArraySource
 from kiln_workers.render.tile import TexelBatch, TileRenderer
 from kiln_workers.scene.texel_map import TexelState
 from kiln_workers.scene.texels import build_texel_map
-from kiln_workers.stages.tiles import BACK_FACE_LIMIT
 
 LEAST: Final = 8
 MOST: Final = 1024
@@ -121,7 +120,7 @@ def _render(
     batch = TexelBatch.of(texel_map, (row, column))
     renderer = TileRenderer(subject.scene, subject.manifest.scene_hash, settings, memory_bytes)
     made = renderer.render_light_fields(batch, on_progress)
-    keep = made.back_faces <= BACK_FACE_LIMIT
+    keep = ~made.enclosed
     return {
         "images": made.light_field[keep],
         "normals": batch.normal[keep],

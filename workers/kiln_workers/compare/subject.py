@@ -23,6 +23,7 @@ from kiln_schemas.settings import BakeSettings, Function
 from kiln_workers.scene.environment import read_environment
 from kiln_workers.scene.gltf import read_gltf
 from kiln_workers.scene.model import Environment, Scene
+from kiln_workers.scene.origin import about_own_centre
 from kiln_workers.shade.package import read_manifest
 from kiln_workers.store.light_field import LightFieldStore
 
@@ -132,7 +133,7 @@ def _scene(folder: Path, manifest: Manifest) -> Scene:
     wanted = {file.name: file.sha256 for file in manifest.files}.get(SCENE_GLB)
     if hashlib.sha256(path.read_bytes()).hexdigest() != wanted:
         raise InputError("was changed since the bake", where=str(path), remedy="Download the package again.")
-    scene = read_gltf(folder, SCENE_GLB)
+    scene = about_own_centre(read_gltf(folder, SCENE_GLB))
     for mesh in scene.meshes:
         if mesh.lightmap_uv is None:
             raise InputError("has no TEXCOORD_1", where=f"{folder / SCENE_GLB}: {mesh.name}")

@@ -19,7 +19,6 @@ from kiln_workers.compare.texels import ChosenTexels
 from kiln_workers.fit.field import BetweenPoints
 from kiln_workers.render.between import PlacedPoints, place_between, trace_halves
 from kiln_workers.render.tile import TexelBatch, TileRenderer
-from kiln_workers.stages.tiles import BACK_FACE_LIMIT
 
 Float16 = npt.NDArray[np.float16]
 Float32 = npt.NDArray[np.float32]
@@ -115,7 +114,7 @@ def _trace(
     settings = subject.settings.render.model_copy(update={"samples": samples})
     texels = chosen.texel_map.state.size
     traced = trace_halves(subject.scene, scene_hash, settings, placed, texels, memory_bytes, on_progress)
-    keep = np.flatnonzero(traced.back_faces <= BACK_FACE_LIMIT)
+    keep = np.flatnonzero(~traced.enclosed)
     arrays = {"first": traced.halves[0][keep], "second": traced.halves[1][keep], **_places(placed, keep)}
     return {}, arrays
 

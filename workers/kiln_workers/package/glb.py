@@ -1,7 +1,8 @@
 """`scene.glb`: the baked scene as binary glTF 2.0 with the light-map UV set as TEXCOORD_1.
 
 Meshes are already flattened to world space (`scene.model`), so every node is an identity with one mesh, and the
-vertices of the GLB are those that were baked. Textures are embedded as PNG. Extensions used:
+vertices of the GLB are those that were baked. Those of a scene far from the origin are about a point amid it; a node
+above all others moves them to where the user had them. Textures are embedded as PNG. Extensions used:
 KHR_materials_emissive_strength, KHR_texture_transform, KHR_lights_punctual; all optional to a reader. Written with
 pygltflib because trimesh loses TEXCOORD_1.
 """
@@ -125,7 +126,11 @@ def encode_glb(scene: Scene) -> bytes:
         document.extensions = {"KHR_lights_punctual": {"lights": [_light(light) for light in scene.lights]}}
         document.nodes += [_light_node(number, light) for number, light in enumerate(scene.lights)]
         writer.extensions.add("KHR_lights_punctual")
-    document.scenes = [gltf.Scene(nodes=list(range(len(document.nodes))))]
+    roots = list(range(len(document.nodes)))
+    if any(scene.origin):
+        document.nodes.append(gltf.Node(name="origin", translation=list(scene.origin), children=roots))
+        roots = [len(document.nodes) - 1]
+    document.scenes = [gltf.Scene(nodes=roots)]
     document.scene = 0
     document.extensionsUsed = sorted(writer.extensions)
     writer.blob += bytes(-len(writer.blob) % 4)

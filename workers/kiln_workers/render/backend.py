@@ -110,6 +110,16 @@ def select_variant(device: Device | str = "auto", threads: int | None = None) ->
     return variant
 
 
+def watertight() -> dict[str, bool]:
+    """What a Mitsuba scene's dictionary has to hold so that no ray slips through between two triangles.
+
+    OptiX intersects watertight by itself; Embree does so only when asked.
+    """
+    import mitsuba as mi
+
+    return {"embree_use_robust_intersections": True} if str(mi.variant()).startswith("llvm") else {}
+
+
 @lru_cache(maxsize=1)
 def has_cuda() -> bool:
     """Whether NVIDIA's driver is installed and Dr.Jit can use a device with it."""

@@ -93,7 +93,7 @@ class TracedHalves:
     """Two independent light fields of each of B points."""
 
     halves: tuple[Float16, Float16]  # each [B, R, R, 3]
-    back_faces: Float32  # [B] fraction of primary rays that meet a back face
+    enclosed: Bools  # [B] whether the point is dark and lies inside something
     samples: int  # paths a pixel, both halves together
 
 
@@ -142,8 +142,8 @@ def trace_halves(
             on_progress(0.5 * (half + done))
 
         made.append(renderer.render_light_fields(batch, report))
-    back_faces = 0.5 * (made[0].back_faces + made[1].back_faces)
-    return TracedHalves((made[0].light_field, made[1].light_field), back_faces, 2 * each)
+    enclosed = made[0].enclosed & made[1].enclosed
+    return TracedHalves((made[0].light_field, made[1].light_field), enclosed, 2 * each)
 
 
 def moved_scene(scene: Scene, step: tuple[int, int], shape: tuple[int, int]) -> Scene:
@@ -160,7 +160,7 @@ def _moved_map(scene: Scene, texel_map: TexelMap, step: tuple[int, int], device:
     """The texel map of the moved scene, and which of its texels [H, W] are points that count."""
     shape = (texel_map.state.shape[0], texel_map.state.shape[1])
     moved_to = moved_scene(scene, step, shape)
-    rasterised = rasterise_texels(moved_to, shape[0])
+    rasterised = rasterise_texels(moved_to, shape[0], device)
     pushed = push_out(moved_to, rasterised, device)
     corners = np.concatenate([_uv(mesh.lightmap_uv)[mesh.faces] for mesh in moved_to.meshes])
     touched = touched_squares(corners * [shape[1], shape[0]], shape[1], shape[0])

@@ -11,10 +11,11 @@ from typing import Any, Final
 import numpy as np
 
 from kiln_workers.render import textures
-from kiln_workers.render.backend import select_variant
+from kiln_workers.render.backend import select_variant, watertight
 from kiln_workers.render.emitters import register_emitters
 from kiln_workers.render.gltf_bsdf import register_bsdfs
 from kiln_workers.render.jit import dr, mi
+from kiln_workers.scene.geometry import Floats
 from kiln_workers.scene.model import (
     Environment,
     Float32,
@@ -25,12 +26,13 @@ from kiln_workers.scene.model import (
     Scene,
     TextureRef,
 )
+from kiln_workers.scene.precision import face_clearance
 
 MIN_ROUGHNESS: Final = 0.05
 """Below this the GGX peak outgrows float32 and no sampler finds it; alpha 0.0025 is a mirror at any image size here."""
 
-SHEET_GAP: Final = 1e-6
-"""Distance between the two sheets of a double-sided emitter, as a fraction of the scene's diagonal."""
+SHEET_GAP: Final = 2.0
+"""Distance between the two sheets of a double-sided emitter, in clearances of its faces."""
 
 
 def to_mitsuba(scene: Scene) -> Any:
@@ -40,7 +42,7 @@ def to_mitsuba(scene: Scene) -> Any:
     register_emitters()
     register_bsdfs()
     powers = _EmitterPowers(scene)
-    parts: dict[str, Any] = {"type": "scene"}
+    parts: dict[str, Any] = {"type": "scene", **watertight()}
     bsdfs: dict[int, Any] = {}
     for number, mesh in enumerate(scene.meshes):
         if not len(mesh.faces):
@@ -52,7 +54,7 @@ def to_mitsuba(scene: Scene) -> Any:
         weight = powers.mesh_weight(mesh)
         parts[f"mesh_{number}"] = _mesh(mesh, material, bsdfs[key], _emission(scene, material, mesh, weight))
         if max(material.emission) > 0.0 and material.double_sided:
-            back = back_sheet(mesh, SHEET_GAP * scene_diagonal(scene))
+            back = back_sheet(mesh, SHEET_GAP * face_clearance(mesh.positions, mesh.faces))
             parts[f"mesh_{number}_back"] = _mesh(back, material, bsdfs[key], _emission(scene, material, back, weight))
     for number, light in enumerate(scene.lights):
         parts[f"light_{number}"] = _light(light, powers.light_weight(light))
@@ -82,12 +84,12 @@ def scene_diagonal(scene: Scene) -> float:
     return max(float(np.linalg.norm(high.astype(np.float64) - low)), 1e-6)
 
 
-def back_sheet(mesh: Mesh, gap: float) -> Mesh:
-    """The mesh's faces turned over and moved `gap` metres behind it, each on vertices of its own."""
+def back_sheet(mesh: Mesh, gap: Floats) -> Mesh:
+    """The mesh's faces turned over and moved `gap` [F] metres behind it, each on vertices of its own."""
     corners = mesh.positions[mesh.faces].astype(np.float64)  # [F, 3, 3]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
-    positions = (corners - gap * normal[:, None])[:, ::-1].reshape(-1, 3).astype(np.float32)
+    positions = (corners - (gap[:, None] * normal)[:, None])[:, ::-1].reshape(-1, 3).astype(np.float32)
     order = mesh.faces[:, ::-1].reshape(-1)
     return Mesh(
         name=f"{mesh.name} (back)",

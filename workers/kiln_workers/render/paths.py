@@ -16,8 +16,9 @@ import numpy as np
 
 from kiln_workers.render import counters
 from kiln_workers.render.jit import dr, mi
-from kiln_workers.render.mitsuba_scene import mesh_number, scene_bounds, scene_diagonal, to_mitsuba
+from kiln_workers.render.mitsuba_scene import mesh_number, to_mitsuba
 from kiln_workers.scene.model import Scene
+from kiln_workers.scene.precision import face_clearance, face_pull
 
 ROULETTE_FROM: Final = 3
 """Scattering events that a path makes before roulette may end it."""
@@ -25,8 +26,17 @@ ROULETTE_FROM: Final = 3
 MAX_LAYERS: Final = 64
 """Cut-out surfaces that one ray passes, at most."""
 
-TEXEL_OFFSET: Final = 1e-3
-"""Rays leave a texel this fraction of its size above the surface (or the rounding error, if larger)."""
+TEXEL_OFFSET: Final = 2e-4
+"""Rays leave a texel this fraction of its size above its point."""
+
+SHADOW_SLACK: Final = 1e-5
+"""Shadow rays end this fraction of their length before the light."""
+
+EDGE_CLEARANCES: Final = 4.0
+"""Clearances that a path's vertices keep from the edges of their faces."""
+
+LEAST_COSINE: Final = 0.01
+"""At a grazing hit a ray steps back no further than at this cosine."""
 
 OPACITY_THRESHOLD: Final = 0.5
 """Opacities are 0 or 1 (`textures.thresholded`)."""
@@ -50,7 +60,6 @@ class LaneSums:
     radiance: Any  # Color3f: sum of weight times radiance
     weight: Any  # Float: sum of the weights of samples in use
     paths: Any  # UInt32: samples in use
-    back_faces: Any  # UInt32: paths whose first hit is the back of a single-sided surface
     dropped: Any  # UInt32: paths that were not finite
 
 
@@ -61,23 +70,52 @@ class PathTracer:
         self.scene = to_mitsuba(scene)
         self.max_depth = max_depth
         self.has_cutouts = any(scene.materials[mesh.material].alpha_cutoff is not None for mesh in scene.meshes)
-        low, high = scene_bounds(scene)
-        # Embree's and our own rounding grow with the size of triangles and with the distance from the origin.
-        self.rounding = 2e-6 * scene_diagonal(scene) + 4e-6 * float(np.abs(np.stack([low, high])).max())
-        self.double_sided = self._double_sided_table(scene)
+        self._tabulate(scene)
 
-    def _double_sided_table(self, scene: Scene) -> Any:
-        """UInt32 by Dr.Jit's identifier of the shape: 1 where the material is double-sided."""
+    def _tabulate(self, scene: Scene) -> None:
+        """By Dr.Jit's identifier of the shape: is it double-sided, its first face; by face: clearance and pull."""
         shapes = self.scene.shapes()
         identifiers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
-        table = np.zeros(max(identifiers, default=0) + 1, np.uint32)
+        double_sided, first = (np.zeros(max(identifiers, default=0) + 1, np.uint32) for _ in range(2))
+        clearances, pulls, count = [np.zeros(1)], [np.zeros((1, 4))], 1
+        self.emitter_clearance = 0.0
         for shape, identifier in zip(shapes, identifiers, strict=True):
-            table[identifier] = scene.materials[scene.meshes[mesh_number(shape)].material].double_sided
-        return mi.UInt32(table)
+            mesh = scene.meshes[mesh_number(shape)]
+            double_sided[identifier] = scene.materials[mesh.material].double_sided
+            first[identifier] = count
+            clearances.append(face_clearance(mesh.positions, mesh.faces))
+            pulls.append(face_pull(mesh.positions, mesh.faces, EDGE_CLEARANCES * clearances[-1]))
+            count += len(mesh.faces)
+            if shape.is_emitter():
+                self.emitter_clearance = max(self.emitter_clearance, float(clearances[-1].max()))
+        self.double_sided, self.first_face = mi.UInt32(double_sided), mi.UInt32(first)
+        self.face_clearance = mi.Float(np.concatenate(clearances).astype(np.float32))
+        self.face_pull = mi.Float(np.concatenate(pulls).astype(np.float32).ravel())
 
-    def leave(self, position: Any, normal: Any, direction: Any) -> Any:
-        """Origin [Point3f] of a ray that leaves a surface point towards `direction`."""
-        return mi.Point3f(position + dr.mulsign(self.rounding, dr.dot(normal, direction)) * normal)
+    def _face(self, si: Any) -> Any:
+        """Number [UInt32] of the face that was hit, in the tables by face; 0 where none was."""
+        first = dr.gather(mi.UInt32, self.first_face, dr.reinterpret_array(mi.UInt32, si.shape), si.is_valid())
+        return dr.select(si.is_valid(), first + si.prim_index, 0)
+
+    def vertex(self, si: Any, direction: Any) -> Any:
+        """Where rays start [Point3f] that leave a hit on the side from which `direction` came.
+
+        The point lies on the way that the ray has just come, so that it is not behind another surface: a clearance
+        above its own face, off the edges of which it is moved too, because another wall may stand there.
+        """
+        face = self._face(si)
+        pull = dr.gather(mi.Vector4f, self.face_pull, face)
+        inside = si.p + pull.w * (mi.Point3f(pull.x, pull.y, pull.z) - si.p)
+        return mi.Point3f(inside - dr.minimum(self._step(si, face, direction), 0.5 * si.t) * direction)
+
+    def beyond(self, si: Any, direction: Any) -> Any:
+        """The point [Point3f] on a ray in which it goes on behind a hit."""
+        return mi.Point3f(si.p + self._step(si, self._face(si), direction) * direction)
+
+    def _step(self, si: Any, face: Any, direction: Any) -> Any:
+        """Metres [Float] along `direction` that lead a clearance off the face."""
+        cosine = dr.abs(dr.dot(si.n, direction))
+        return dr.gather(mi.Float, self.face_clearance, face) / dr.maximum(cosine, LEAST_COSINE)
 
     @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
     def closest(self, ray: Any, active: Any) -> Any:
@@ -87,7 +125,7 @@ class PathTracer:
             layers = mi.UInt32(0)
             through = active & si.is_valid() & (self._opacity(si, active) < OPACITY_THRESHOLD)
             while through:
-                onwards = mi.Ray3f(self.leave(si.p, si.n, ray.d), ray.d, ray.maxt, ray.time, ray.wavelengths)
+                onwards = mi.Ray3f(self.beyond(si, ray.d), ray.d, ray.maxt, ray.time, ray.wavelengths)
                 onwards.maxt = ray.maxt - dr.norm(onwards.o - ray.o)
                 behind = self.scene.ray_intersect(onwards, mi.RayFlags.All, False, through)
                 si = dr.select(through, behind, si)
@@ -103,7 +141,7 @@ class PathTracer:
         segment = target - origin
         distance = dr.norm(segment)
         ray = mi.Ray3f(origin, segment / distance)
-        ray.maxt = distance * (1.0 - 1e-4)
+        ray.maxt = dr.maximum(distance * (1.0 - SHADOW_SLACK) - self.emitter_clearance, 0.0)
         return self.blocked(ray, active)
 
     def blocked(self, ray: Any, active: Any) -> Any:
@@ -112,11 +150,11 @@ class PathTracer:
             return self.scene.ray_test(ray, active)
         return self.closest(ray, active).is_valid()
 
-    def light_at(self, si: Any, origin: Any, sample: Any, active: Any) -> tuple[Any, Any]:
-        """Next-event estimation: direction sample and unoccluded radiance / pdf (0 where occluded)."""
+    def light_at(self, si: Any, sample: Any, active: Any) -> tuple[Any, Any]:
+        """Next-event estimation at a point off a surface: direction sample, and unoccluded radiance / pdf."""
         ds, weight = self.scene.sample_emitter_direction(si, sample, False, active)
         active = active & (ds.pdf != 0.0) & (dr.max(weight) > 0.0)
-        active &= ~self.occluded(self.leave(origin, si.n, ds.d), ds.p, active)
+        active &= ~self.occluded(si.p, ds.p, active)
         return ds, dr.select(active, weight, 0.0)
 
     @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
@@ -128,7 +166,7 @@ class PathTracer:
         width = dr.width(lanes)
         zeros = dr.zeros(mi.UInt32, width)
         radiance, weight_sum = dr.zeros(mi.Color3f, width), dr.zeros(mi.Float, width)
-        paths, back_faces, dropped = mi.UInt32(zeros), mi.UInt32(zeros), mi.UInt32(zeros)
+        paths, dropped = mi.UInt32(zeros), mi.UInt32(zeros)
         sample, depth = mi.UInt32(zeros), mi.UInt32(zeros)
         state = mi.UInt64(lanes)
         origin, direction = dr.zeros(mi.Point3f, width), dr.zeros(mi.Vector3f, width)
@@ -155,11 +193,11 @@ class PathTracer:
             self._orient(si, ray)
             thin = dr.gather(mi.UInt32, self.double_sided, dr.reinterpret_array(mi.UInt32, si.shape), si.is_valid())
             behind = si.is_valid() & (dr.dot(si.n, direction) > 0.0) & (thin == 0)
-            back_faces += dr.select(on_path & behind & (depth == 0), 1, 0)
 
             emits = on_path & (si.is_valid() | (depth > 0) | sees_environment)
             path_radiance += throughput * self._emitted(si, before, before_pdf, emits)
             scatters = on_path & si.is_valid() & (depth < self.max_depth) & ~behind
+            si.p = self.vertex(si, direction)
             state, u = counters.pair(state)
             path_radiance += throughput * self._direct(si, direction, u, scatters)
 
@@ -186,11 +224,11 @@ class PathTracer:
             sample += dr.select(ends, 1, 0)
             on_path = survives & running
             before, before_pdf = mi.Point3f(si.p), mi.Float(scattered.pdf)
-            origin, direction = self.leave(si.p, si.n, onwards), mi.Vector3f(onwards)
+            origin, direction = mi.Point3f(si.p), mi.Vector3f(onwards)
             depth += 1
             running = on_path | (sample < samples)
 
-        return LaneSums(radiance, weight_sum, paths, back_faces, dropped)
+        return LaneSums(radiance, weight_sum, paths, dropped)
 
     @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
     def direct(self, lanes: Any, samples: Any, position: Any, normal: Any, shading_normal: Any) -> Any:
@@ -205,7 +243,7 @@ class PathTracer:
         at.sh_frame = mi.Frame3f(at.n)
         while sample < samples:
             active = sample < samples
-            ds, arriving = self.light_at(at, position, counters.stratified_pair(lanes, sample), active)
+            ds, arriving = self.light_at(at, counters.stratified_pair(lanes, sample), active)
             cosine = dr.dot(shading_normal, ds.d)
             above = (cosine > 0.0) & (dr.dot(normal, ds.d) > 0.0)
             share = dr.select(ds.delta, 1.0, _power_heuristic(ds.pdf, cosine * dr.inv_pi))
@@ -231,7 +269,7 @@ class PathTracer:
 
         Weighted against BSDF sampling.
         """
-        ds, arriving = self.light_at(si, si.p, sample, active)
+        ds, arriving = self.light_at(si, sample, active)
         value, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
         same_side = dr.dot(si.n, ds.d) * dr.dot(si.n, direction) < 0.0
         share = dr.select(ds.delta, 1.0, _power_heuristic(ds.pdf, pdf))
@@ -242,6 +280,11 @@ class PathTracer:
         turned = dr.dot(si.sh_frame.n, ray.d) * dr.dot(si.n, ray.d) <= 0.0
         si.sh_frame = dr.select(turned, mi.Frame3f(si.n), si.sh_frame)
         si.wi = dr.select(turned & si.is_valid(), si.to_local(-ray.d), si.wi)
+
+
+def off_surface(position: Any, normal: Any, direction: Any, clearance: Any) -> Any:
+    """The point [Point3f] `clearance` metres off a surface, on the side that `direction` leads to."""
+    return mi.Point3f(position + dr.mulsign(clearance, dr.dot(normal, direction)) * normal)
 
 
 def _power_heuristic(own: Any, other: Any) -> Any:

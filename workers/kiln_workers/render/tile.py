@@ -16,7 +16,7 @@ import numpy.typing as npt
 from kiln_schemas.conventions import FP16_MAX
 from kiln_schemas.errors import MachineLacks
 from kiln_schemas.settings import RenderSettings
-from kiln_workers.render import counters
+from kiln_workers.render import counters, enclosure
 from kiln_workers.render.backend import Device, select_variant
 from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.paths import TEXEL_OFFSET, LaneSums, PathTracer, Start
@@ -72,7 +72,7 @@ class TileImages:
     light_field: Float16  # [T, R, R, 3] radiance without the directly seen environment
     visibility: Float16 | None  # [T, R, R, 3] W_E; None without an environment
     irradiance: Float32  # [T, 3] W/m^2, over the shading normal's hemisphere above the surface
-    back_faces: Float32  # [T] fraction of primary rays that meet the back of a single-sided surface
+    enclosed: npt.NDArray[np.bool_]  # [T] no light reaches the texel, and it lies inside something (`enclosure`)
     paths: int
     overflows: int  # values clamped to the fp16 range, and paths dropped because they were not finite
 
@@ -113,6 +113,7 @@ class TileRenderer:
             fields,
             visibility=visibility,
             irradiance=irradiance,
+            enclosed=fields.enclosed & ~irradiance.any(axis=1),
             paths=fields.paths + irradiance_paths,
             overflows=fields.overflows + dropped,
         )
@@ -125,37 +126,39 @@ class TileRenderer:
         samples: int | None = None,
         offsets: Int64 | None = None,
     ) -> TileImages:
-        """The light-field images and back faces alone; no visibility, irradiance zero.
+        """The light-field images, and which dark ones are enclosed; no visibility, irradiance zero.
 
         `samples` paths a pixel instead of the settings'. With `offsets` [T, 2] only one pixel of each 2 x 2 block is
-        traced, that row and column of the block.
+        traced, that row and column of the block, and no texel is judged.
         """
         size, samples = self.settings.image_size, samples or self.settings.samples
         out = np.zeros((len(texels), size * size, 3), np.float16)
-        back, paths = np.zeros(len(texels), np.int64), np.zeros(len(texels), np.int64)
-        overflows = 0
+        paths = overflows = 0
         for part, fraction in self._pixel_wavefronts(texels, offsets):
             texel, pixel = part[:, 0], part[:, 1]
             sums = self._trace_pixels(texels, texel, pixel, samples)
             mean = np.array(sums.radiance).T / np.maximum(np.array(sums.weight), 1e-30)[:, None]
             out[texel, pixel], clamped = to_half(mean)
-            np.add.at(back, texel, np.array(sums.back_faces))
-            np.add.at(paths, texel, np.array(sums.paths))
+            paths += int(np.array(sums.paths).sum())
             overflows += clamped + int(np.array(sums.dropped).sum())
             on_progress(fraction)
+        enclosed = np.zeros(len(texels), bool)
+        if offsets is None:
+            dark = np.flatnonzero(~out.any(axis=(1, 2)))
+            enclosed[dark] = enclosure.enclosed(self.tracer, _origins(texels)[dark], texels.normal[dark])
         return TileImages(
             light_field=out.reshape(len(texels), size, size, 3),
             visibility=None,
             irradiance=np.zeros((len(texels), 3), np.float32),
-            back_faces=(back / np.maximum(paths, 1)).astype(np.float32),
-            paths=int(paths.sum()),
+            enclosed=enclosed,
+            paths=paths,
             overflows=overflows,
         )
 
     def _trace_pixels(self, texels: TexelBatch, texel: Int64, pixel: Int64, samples: int) -> LaneSums:
         """One wavefront of light-field pixels."""
         size = self.settings.image_size
-        points = _Points(texels, texel, self.tracer.rounding)
+        points = _Points(texels, texel)
         pixels = mi.UInt32(pixel.astype(np.uint32))
         corner = mi.Vector2f(mi.Float(pixels % size), mi.Float(pixels // size))
         density = self.pixel_area / dr.gather(mi.Float, self.solid_angles, pixels)
@@ -169,7 +172,7 @@ class TileRenderer:
 
         count = dr.full(mi.UInt32, samples, len(texel))
         sums: LaneSums = self.tracer.trace(lanes, count, start, False)
-        dr.eval(sums.radiance, sums.weight, sums.paths, sums.back_faces, sums.dropped)
+        dr.eval(sums.radiance, sums.weight, sums.paths, sums.dropped)
         return sums
 
     def _irradiance(self, texels: TexelBatch, on_progress: Progress) -> tuple[Float32, int, int]:
@@ -190,7 +193,7 @@ class TileRenderer:
 
     def _trace_irradiance(self, texels: TexelBatch, texel: Int64, block: Int64, counts: Int64) -> tuple[LaneSums, Any]:
         """One wavefront of blocks of irradiance samples: cosine-distributed paths, and next-event estimates."""
-        points = _Points(texels, texel, self.tracer.rounding)
+        points = _Points(texels, texel)
         blocks, count = mi.UInt32(block.astype(np.uint32)), mi.UInt32(counts.astype(np.uint32))
         # The texel's samples form one low-discrepancy set over all of its blocks.
         shared = counters.lane_state(self.key, counters.STREAM_IRRADIANCE, points.index, mi.UInt32(0))
@@ -222,7 +225,7 @@ class TileRenderer:
         for first in range(0, len(texels), group):
             numbers = slice(first, first + group)
             lanes = lanes_above_horizon(texels.normal[numbers], size)
-            points = _Points(texels, lanes[:, 0] + first, self.tracer.rounding)
+            points = _Points(texels, lanes[:, 0] + first)
             pixels = mi.UInt32(lanes[:, 1].astype(np.uint32))
             hashes = texel_hash(self.key, points.index)
             seen, above = trace_visibility(self.tracer, self.table, hashes, pixels, points.origin, points.normal)
@@ -258,13 +261,17 @@ class TileRenderer:
 class _Points:
     """A wavefront's texels as Dr.Jit arrays, one entry a lane; origins already lifted off the surface."""
 
-    def __init__(self, texels: TexelBatch, texel: Int64, rounding: float) -> None:
-        lift = np.maximum(TEXEL_OFFSET * texels.texel_size, np.float32(rounding))[:, None]
-        origin = (texels.position + lift * texels.normal).astype(np.float32)
+    def __init__(self, texels: TexelBatch, texel: Int64) -> None:
+        origin = _origins(texels)
         self.index = mi.UInt64(texels.index[texel].astype(np.uint64))
         self.origin = mi.Point3f(np.ascontiguousarray(origin[texel].T))
         self.normal = mi.Vector3f(np.ascontiguousarray(texels.normal[texel].T))
         self.shading_normal = mi.Vector3f(np.ascontiguousarray(texels.shading_normal[texel].T))
+
+
+def _origins(texels: TexelBatch) -> Float32:
+    """Where rays start [T, 3], off the surface."""
+    return (texels.position + (TEXEL_OFFSET * texels.texel_size)[:, None] * texels.normal).astype(np.float32)
 
 
 def wavefront_lanes(memory_bytes: int) -> int:

@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from typing import Any, Final
 
 import numpy as np
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, FiniteFloat, TypeAdapter, ValidationError
 
 from kiln_schemas.errors import InputError
 from kiln_workers.scene.container import Array, chunks, pack, unpack
@@ -41,6 +41,7 @@ class _Body(BaseModel):
     images: list[_ImageEntry]
     environment: _EnvironmentEntry | None
     notes: list[str]
+    origin: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 def pack_scene(scene: Scene) -> bytes:
@@ -72,6 +73,7 @@ def unpack_scene(data: bytes) -> Scene:
         lights=tuple(lights),
         environment=environment,
         notes=tuple(entries.notes),
+        origin=entries.origin,
     )
     _check_references(scene)
     return scene
@@ -80,7 +82,7 @@ def unpack_scene(data: bytes) -> Scene:
 def scene_hash(scene: Scene, settings: BaseModel | None = None) -> str:
     """sha256 over all that the light depends on: geometry, light-map UV, materials, textures, lights, environment.
 
-    Names and notes are left out. `settings`, where given, are hashed with it.
+    Names, notes and the origin are left out. `settings`, where given, are hashed with it.
     """
     bare = replace(
         scene,
@@ -89,6 +91,7 @@ def scene_hash(scene: Scene, settings: BaseModel | None = None) -> str:
         images=tuple(replace(image, name="") for image in scene.images),
         lights=tuple(replace(light, name="") for light in scene.lights),
         notes=(),
+        origin=(0.0, 0.0, 0.0),
     )
     digest = hashlib.sha256()
     for piece in chunks(KIND, *_parts(bare)):
@@ -124,6 +127,7 @@ def _parts(scene: Scene) -> tuple[dict[str, Any], dict[str, Array]]:
         "lights": [asdict(light) for light in scene.lights],
         "environment": environment,
         "notes": list(scene.notes),
+        "origin": list(scene.origin),
     }
     return body, arrays
 

@@ -38,7 +38,10 @@ class RawMesh:
 
 
 def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, list[str]]:
-    """The mesh in world space under a 4 x 4 transform (column vectors), None if no face is left, and notes."""
+    """The mesh in world space under a 4 x 4 transform (column vectors), None if no face is left, and notes.
+
+    Its positions are float64 still: `origin.about_own_centre` makes them float32 when the whole scene is known.
+    """
     _check(raw)
     notes: list[str] = []
     matrix = np.eye(4) if transform is None else np.asarray(transform, dtype=np.float64)
@@ -48,11 +51,11 @@ def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, l
     with np.errstate(over="ignore", invalid="ignore"):
         placed = raw.positions @ linear.T + matrix[:3, 3]
         _check_rows(np.abs(placed).max(axis=1, initial=0.0) <= MAX_COORDINATE, raw, f"is beyond {MAX_COORDINATE:g} m")
-    positions = placed.astype(np.float32)
+    positions: Floats = placed
     mirrored = bool(np.linalg.det(linear) < 0.0)
     faces = raw.faces[:, ::-1] if mirrored else raw.faces
 
-    keep = _sound_faces(positions.astype(np.float64), faces)
+    keep = sound_faces(positions, faces)
     dropped = len(faces) - int(keep.sum())
     if dropped:
         notes.append(f"Mesh '{raw.name}': {dropped} degenerate face{'s' if dropped > 1 else ''} dropped.")
@@ -76,7 +79,7 @@ def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, l
             notes.append(f"Mesh '{raw.name}': {mended} unusable vertex normals replaced by those of its faces.")
     mesh = Mesh(
         name=raw.name,
-        positions=np.ascontiguousarray(positions),
+        positions=np.ascontiguousarray(positions),  # float32 only about the scene's centre
         normals=normals.astype(np.float32),
         faces=faces.astype(np.int32),
         material=raw.material,
@@ -134,16 +137,15 @@ def _double_areas(positions: Floats, faces: npt.NDArray[np.integer]) -> Floats:
     return np.asarray(np.cross(b - a, c - a))
 
 
-def _sound_faces(positions: Floats, faces: Ints) -> npt.NDArray[np.bool_]:
+def sound_faces(positions: Floats, faces: Ints) -> npt.NDArray[np.bool_]:
+    """Which faces [F] are no slivers (see `SLIVER`)."""
     corners = positions[faces]  # [F, 3, 3]
     longest = (np.diff(corners[:, [0, 1, 2, 0]], axis=1) ** 2).sum(axis=2).max(axis=1)
     cross = np.linalg.norm(_double_areas(positions, faces), axis=1)
     return np.asarray(cross > SLIVER * longest)
 
 
-def _transformed_normals(
-    normals: Floats, linear: Floats, positions: npt.NDArray[np.float32], faces: Ints
-) -> tuple[Floats, int]:
+def _transformed_normals(normals: Floats, linear: Floats, positions: Floats, faces: Ints) -> tuple[Floats, int]:
     # The cofactor matrix is det(M) M^-T and exists for singular M too; its sign is taken out for mirrors.
     a, b, c = linear[:, 0], linear[:, 1], linear[:, 2]
     cofactor = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
@@ -154,7 +156,7 @@ def _transformed_normals(
     bad |= length[:, 0] <= 1e-30
     world = world / np.where(length > 1e-30, length, 1.0)
     if bad.any():
-        world[bad] = smooth_normals(positions.astype(np.float64), faces)[bad]
+        world[bad] = smooth_normals(positions, faces)[bad]
     return world, int(bad.sum())
 
 

@@ -16,6 +16,7 @@ from kiln_workers.scene.limits import READING_S, deadline
 from kiln_workers.scene.mitsuba_xml import read_mitsuba_xml
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.obj import read_obj
+from kiln_workers.scene.origin import about_own_centre
 from kiln_workers.scene.ply import read_ply
 
 READERS: Final[Mapping[str, Callable[[Path, str], Scene]]] = {
@@ -41,7 +42,7 @@ def load_scene(folder: Path, entry: str, environment: EnvironmentRef | None = No
 
 
 def _read(reader: Callable[[Path, str], Scene], folder: Path, entry: str, environment: EnvironmentRef | None) -> Scene:
-    scene = reader(folder, entry)
+    scene = about_own_centre(reader(folder, entry))
     if not scene.triangles:
         raise InputError("has no faces", where=entry, remedy="Export at least one mesh with triangles of some area.")
     if environment is None:

@@ -107,6 +107,8 @@ class Scene:
     lights: tuple[PunctualLight, ...] = ()
     environment: Environment | None = None
     notes: tuple[str, ...] = field(default=(), compare=False)
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the user's file has this scene's (0, 0, 0), in metres (`scene.origin`)."""
 
     @property
     def triangles(self) -> int:

@@ -4,28 +4,32 @@ A texel's point is one sample of a small square of surface; where a pillar stand
 it and would see nothing but the pillar's inside (Rakhteenko 2018, "Baking artifact-free lightmaps"). From each point
 eight rays run along the surface over half a texel. One that meets a back face first has left a solid: just past that
 hit is a candidate, and the nearest candidate that sees no back face within half a texel itself is taken. A path to
-a candidate crosses no front face, and a candidate behind a thin wall or floor sees that wall's back, so nothing leaks.
-Points without a good candidate stay; the render task counts the back faces that they see and marks them invalid.
-Double-sided materials have no back face.
+a candidate crosses no front face, a candidate behind a thin wall or floor sees that wall's back, and a candidate lies
+on the texel's own mesh, so nothing leaks.
+Points without a good candidate stay; the render task marks those that lie inside something invalid. Only faces with one
+side push: a double-sided one may as well be the wall of a room.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from kiln_workers.render.backend import Device, select_variant
+from kiln_workers.render.backend import Device, select_variant, watertight
 from kiln_workers.scene.geometry import Floats, Ints, face_normals
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.texel_map import TexelMap, TexelState
 
+Bools = npt.NDArray[np.bool_]
+
 DIRECTIONS: Final = 8
 REACH_TEXELS: Final = 0.5
 BIAS_TEXELS: Final = 0.01
-"""Distance kept from surfaces, in texels; at least `BIAS_EXTENT` of the scene's size, which float32 resolves."""
-BIAS_EXTENT: Final = 2e-6
+"""Distance kept from surfaces, in texels; at least a few steps of float32."""
+SURFACE_TEXELS: Final = 0.25
+"""A candidate lies no further than this above the mesh that its texel belongs to."""
 
 
 def push_out(scene: Scene, texels: TexelMap, device: Device = "auto") -> TexelMap:
@@ -33,10 +37,13 @@ def push_out(scene: Scene, texels: TexelMap, device: Device = "auto") -> TexelMa
     row, column = np.nonzero(texels.state == TexelState.VALID)
     if not len(row):
         return texels
-    position = texels.position[row, column].astype(np.float64)
-    normal = texels.normal[row, column].astype(np.float64)
-    size = texels.texel_size[row, column].astype(np.float64)
-    moved, place = _free_places(_BackFaces(scene, device), position, normal, size)
+    points = _Points(
+        texels.position[row, column].astype(np.float64),
+        texels.normal[row, column].astype(np.float64),
+        texels.texel_size[row, column].astype(np.float64),
+        texels.mesh[row, column].astype(np.int64),
+    )
+    moved, place = _free_places(BareTriangles(scene, device), points)
     out = texels.position.copy()
     out[row[moved], column[moved]] = place
     return replace(texels, position=out)
@@ -52,41 +59,77 @@ def tangent_directions(normal: Floats) -> Floats:
     return np.asarray(np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * other[:, None])
 
 
-def _free_places(tracer: "_BackFaces", position: Floats, normal: Floats, size: Floats) -> tuple[Ints, Floats]:
+@dataclass(frozen=True)
+class _Points:
+    """N texels' points."""
+
+    position: Floats  # [N, 3]
+    normal: Floats  # [N, 3]
+    size: Floats  # [N] metres
+    mesh: Ints  # [N]
+
+    @property
+    def bias(self) -> Floats:
+        """Metres [N] kept from surfaces."""
+        steps = np.spacing(np.abs(self.position).max(axis=1).astype(np.float32)).astype(np.float64)
+        return np.asarray(np.maximum(BIAS_TEXELS * self.size, 8.0 * steps))
+
+    def take(self, rows: Ints, position: Floats | None = None) -> "_Points":
+        """Some of them, at other positions where these are given."""
+        at = self.position[rows] if position is None else position
+        return _Points(at, self.normal[rows], self.size[rows], self.mesh[rows])
+
+
+def _free_places(triangles: "BareTriangles", points: _Points) -> tuple[Ints, Floats]:
     """Which points have to move, and where to."""
-    bias = np.maximum(BIAS_TEXELS * size, BIAS_EXTENT * tracer.extent)
-    distance = _back_face_distances(tracer, position, normal, size, bias)  # [N, 8]
+    distance = _back_face_distances(triangles, points)  # [N, 8]
     inside = np.flatnonzero(np.isfinite(distance).any(axis=1))
-    position, normal, size, bias = position[inside], normal[inside], size[inside], bias[inside]
-    distance, directions = distance[inside], tangent_directions(normal)
+    distance, points = distance[inside], points.take(inside)
+    directions = tangent_directions(points.normal)
     place = np.full((len(inside), 3), np.nan)
     order = np.argsort(distance, axis=1, kind="stable")
     for rank in range(DIRECTIONS):
-        which = np.arange(len(inside))
-        step = distance[which, order[:, rank]]
+        step = distance[np.arange(len(inside)), order[:, rank]]
         open_ = np.flatnonzero(np.isnan(place[:, 0]) & np.isfinite(step))
         if not len(open_):
             break
         direction = directions[open_, order[open_, rank]]
-        candidate = position[open_] + (step[open_] + bias[open_])[:, None] * direction
-        seen = _back_face_distances(tracer, candidate, normal[open_], size[open_], bias[open_])
-        free = ~np.isfinite(seen).any(axis=1)
+        candidate = points.position[open_] + (step[open_] + points.bias[open_])[:, None] * direction
+        there = points.take(open_, candidate)
+        free = _on_own_mesh(triangles, there) & ~np.isfinite(_back_face_distances(triangles, there)).any(axis=1)
         place[open_[free]] = candidate[free]
     found = ~np.isnan(place[:, 0])
     return inside[found], place[found]
 
 
-def _back_face_distances(tracer: "_BackFaces", position: Floats, normal: Floats, size: Floats, bias: Floats) -> Floats:
+def _on_own_mesh(triangles: "BareTriangles", points: _Points) -> Bools:
+    """Whether the first surface below each point [N] is its own mesh, and near."""
+    origin = points.position + points.bias[:, None] * points.normal
+    below = triangles.nearest(origin, -points.normal, points.bias + SURFACE_TEXELS * points.size)
+    return np.asarray(np.isfinite(below.distance) & (below.mesh == points.mesh))
+
+
+def _back_face_distances(triangles: "BareTriangles", points: _Points) -> Floats:
     """Metres [N, 8] along the tangent directions to a back face that is the first hit within half a texel, else inf."""
-    origin = position + bias[:, None] * normal
-    directions = tangent_directions(normal)
-    rays = directions.reshape(-1, 3)
-    reach = np.repeat(REACH_TEXELS * size, DIRECTIONS)
-    return tracer.distances(np.repeat(origin, DIRECTIONS, axis=0), rays, reach).reshape(-1, DIRECTIONS)
+    origin = np.repeat(points.position + points.bias[:, None] * points.normal, DIRECTIONS, axis=0)
+    rays = tangent_directions(points.normal).reshape(-1, 3)
+    met = triangles.nearest(origin, rays, np.repeat(REACH_TEXELS * points.size, DIRECTIONS))
+    return np.where(met.back & ~met.double_sided, met.distance, np.inf).reshape(-1, DIRECTIONS)
 
 
-class _BackFaces:
-    """Rays against the scene's bare triangles."""
+@dataclass(frozen=True)
+class Met:
+    """What N rays met first."""
+
+    distance: Floats  # [N] metres; inf where nothing
+    face: Ints  # [N] in the list of all meshes' faces
+    mesh: Ints  # [N]
+    back: Bools  # [N] whether from behind
+    double_sided: Bools  # [N]
+
+
+class BareTriangles:
+    """Rays against the scene's triangles, without materials."""
 
     def __init__(self, scene: Scene, device: Device) -> None:
         select_variant(device)
@@ -97,20 +140,17 @@ class _BackFaces:
         positions = np.concatenate([mesh.positions for mesh in scene.meshes])
         faces = np.concatenate([mesh.faces + offset for mesh, offset in zip(scene.meshes, offsets, strict=False)])
         self._normals = face_normals(positions, faces)
-        self._two_sided = np.repeat(
-            [scene.materials[mesh.material].double_sided for mesh in scene.meshes],
-            [len(mesh.faces) for mesh in scene.meshes],
-        )
-        self.extent = float(np.abs(positions).max())
+        self._mesh = np.repeat(np.arange(len(scene.meshes)), [len(mesh.faces) for mesh in scene.meshes])
+        self._double_sided = np.array([scene.materials[mesh.material].double_sided for mesh in scene.meshes], bool)
         shape = mi.Mesh("scene", len(positions), len(faces))
         parameters = mi.traverse(shape)
         parameters["vertex_positions"] = positions.ravel()
         parameters["faces"] = faces.astype(np.uint32).ravel()
         parameters.update()
-        self._scene = mi.load_dict({"type": "scene", "shape": shape})
+        self._scene = mi.load_dict({"type": "scene", "shape": shape, **watertight()})
 
-    def distances(self, origin: Floats, direction: Floats, reach: Floats) -> Floats:
-        """Distance [N] of the first hit if it is a back face within `reach` [N], else inf."""
+    def nearest(self, origin: Floats, direction: Floats, reach: Floats) -> Met:
+        """The first surfaces on rays [N, 3] within `reach` [N] metres."""
         mi = self._mi
         ray = mi.Ray3f(
             o=mi.Point3f(*_columns(origin)),
@@ -120,10 +160,11 @@ class _BackFaces:
             wavelengths=mi.Color0f(),
         )
         hit = self._scene.ray_intersect_preliminary(ray, coherent=False)
-        valid = np.array(hit.is_valid())
+        valid = np.array(hit.is_valid()).astype(bool)
         face = np.where(valid, np.array(hit.prim_index), 0).astype(np.int64)
-        away = np.einsum("nd,nd->n", direction, self._normals[face]) > 0.0
-        return np.where(valid & away & ~self._two_sided[face], np.array(hit.t), np.inf)
+        back = np.einsum("nd,nd->n", direction, self._normals[face]) > 0.0
+        distance = np.where(valid, np.array(hit.t), np.inf).astype(np.float64)
+        return Met(distance, face, self._mesh[face], valid & back, self._double_sided[self._mesh[face]])
 
 
 def _columns(vectors: Floats) -> Sequence[npt.NDArray[np.float32]]:

@@ -28,11 +28,14 @@ class Touched:
     distance: Floats  # [S] from the centre to that point; 0 where the triangle contains the centre
 
 
-def touched_squares(corners: Floats, width: int, height: int) -> Touched:
+def touched_squares(corners: Floats, width: int, height: int, handicap: Floats | None = None) -> Touched:
     """For every square that a triangle of `corners` [F, 3, 2] touches: the nearest to its centre, and its point there.
 
-    A triangle that contains the centre wins with distance 0; among equals the first triangle wins.
+    A triangle that contains the centre wins with distance 0; among equals the first triangle wins. `handicap` [F] is
+    added to a triangle's distance when it competes with others.
     """
+    added = np.zeros(len(corners)) if handicap is None else handicap
+    best_rank = np.full(width * height, np.inf)
     best_distance = np.full(width * height, np.inf)
     best_face = np.full(width * height, -1, dtype=np.int64)
     best_barycentric = np.zeros((width * height, 3))
@@ -40,9 +43,11 @@ def touched_squares(corners: Floats, width: int, height: int) -> Touched:
         square = row * width + column
         centre = np.stack([column + 0.5, row + 0.5], axis=1)
         barycentric, distance = closest_point(corners[face], centre)
-        order = np.lexsort((face, distance, square))
+        rank = distance + added[face]
+        order = np.lexsort((face, rank, square))
         first = order[np.unique(square[order], return_index=True)[1]]
-        better = first[distance[first] < best_distance[square[first]]]
+        better = first[rank[first] < best_rank[square[first]]]
+        best_rank[square[better]] = rank[better]
         best_distance[square[better]] = distance[better]
         best_face[square[better]] = face[better]
         best_barycentric[square[better]] = barycentric[better]
@@ -78,6 +83,20 @@ def closest_point(corners: Floats, point: Floats) -> tuple[Floats, Floats]:
     contained = (inside >= 0.0).all(axis=1)
     best[contained], distance[contained] = inside[contained], 0.0
     return best, distance
+
+
+def kept_inside(barycentric: Floats, heights: Floats, margin: Floats) -> Floats:
+    """Barycentrics [P, 3] moved so that each point lies at least `margin` [P] from every edge of its triangle.
+
+    `heights` [P, 3] are the triangles' heights over the edges opposite to their corners, in the unit of `margin`. Where
+    a triangle is narrower than that, the margin is half the radius of its incircle. Points that have it do not move.
+    """
+    radius = 1.0 / np.maximum((1.0 / np.maximum(heights, 1e-300)).sum(axis=1), 1e-300)
+    least = np.minimum(margin, 0.5 * radius)[:, None] / np.maximum(heights, 1e-300)
+    above = np.maximum(barycentric - least, 0.0)
+    total = above.sum(axis=1, keepdims=True)
+    share = np.divide(above, total, out=np.full_like(above, 1.0 / 3.0), where=total > 0.0)
+    return np.asarray(least + (1.0 - least.sum(axis=1, keepdims=True)) * share)
 
 
 def interior_samples(corners: Floats, size: int, margin: float) -> Iterator[tuple[Ints, Ints]]:

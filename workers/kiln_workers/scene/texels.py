@@ -8,7 +8,12 @@ that contains the centre wins, else the nearest. `alpha` is the material's rough
 Terminator of smooth normals: paths start from the point that Hanika 2021 ("Hacking the Shadow Terminator", Ray Tracing
 Gems II, chapter 4) gives: the flat triangle's point is lifted to the interpolation of its projections on the vertices'
 tangent planes, where those lie above it. It follows the surface that the normals pretend, so facets do not shadow each
-other. Limited to half a texel; flat-shaded and concave faces are not moved.
+other. Limited to half a texel, and to half of the way to whatever lies there; flat-shaded and concave faces are not
+moved.
+
+A point never lies on an edge of its triangle: where the edge is a room's corner, the point would lie in the next wall's
+plane, rays towards that wall would start on it, and what is beyond the wall would be seen. So it keeps `INSET_TEXELS`
+from the edges, and lies as far above the triangle as float32 needs to tell that it does.
 """
 
 from typing import Final
@@ -22,34 +27,48 @@ from kiln_workers.render.backend import Device
 from kiln_workers.scene.container import Array
 from kiln_workers.scene.geometry import Floats, Ints, face_areas, face_normals
 from kiln_workers.scene.model import Image, Mesh, Scene, TextureRef
-from kiln_workers.scene.push_out import push_out
-from kiln_workers.scene.raster import touched_squares
+from kiln_workers.scene.precision import face_clearance
+from kiln_workers.scene.push_out import BareTriangles, push_out
+from kiln_workers.scene.raster import kept_inside, touched_squares
 from kiln_workers.scene.texel_map import TexelMap, TexelState
 
 MIN_ALPHA: Final = 0.002
 MIN_COSINE: Final = 0.05
 """A shading normal is bent towards the geometric one until their cosine is at least this."""
+INSET_TEXELS: Final = 0.02
+"""Distance of a texel's point from the edges of its triangle, in texels; at least `INSET_CLEARANCES` clearances."""
+INSET_CLEARANCES: Final = 4.0
+NARROW_HANDICAP: Final = 0.2
+"""Texels that a triangle too narrow for its points' inset has to be nearer than others to be taken."""
 
 
 def build_texel_map(scene: Scene, resolution: int, device: Device = "auto") -> TexelMap:
     """The texel map of a scene whose meshes have light-map UVs, points pushed out of other geometry."""
-    return push_out(scene, rasterise_texels(scene, resolution), device)
+    return push_out(scene, rasterise_texels(scene, resolution, device), device)
 
 
-def rasterise_texels(scene: Scene, resolution: int) -> TexelMap:
+def rasterise_texels(scene: Scene, resolution: int, device: Device = "auto") -> TexelMap:
     """The texel map before points are pushed out of other geometry."""
     faces = _AllFaces(scene)
-    touched = touched_squares(faces.lightmap_uv * resolution, resolution, resolution)
+    sizes, clearance, heights = (
+        faces.texel_size(resolution),
+        face_clearance(faces.positions, faces.corners),
+        faces.heights(),
+    )
+    inset = np.maximum(INSET_TEXELS * sizes, INSET_CLEARANCES * clearance)
+    narrow = 1.0 / (1.0 / np.maximum(heights, 1e-300)).sum(axis=1) < 2.0 * inset
+    handicap = np.where(narrow, NARROW_HANDICAP, 0.0)
+    touched = touched_squares(faces.lightmap_uv * resolution, resolution, resolution, handicap)
     corner = faces.corners[touched.face]  # [S, 3] rows of the vertex arrays
-    weight = touched.barycentric
+    weight = kept_inside(touched.barycentric, heights[touched.face], inset[touched.face])
 
     normal = faces.normal[touched.face]
-    position = np.einsum("sc,scd->sd", weight, faces.positions[corner])
+    flat = np.einsum("sc,scd->sd", weight, faces.positions[corner])
     shading = np.einsum("sc,scd->sd", weight, faces.normals[corner])
-    size = faces.texel_size(resolution)[touched.face]
-    lift = terminator_offset(position, weight, faces.positions[corner], faces.normals[corner])
-    length = np.linalg.norm(lift, axis=1)
-    lift *= np.minimum(1.0, 0.5 * size / np.maximum(length, 1e-30))[:, None]
+    size = sizes[touched.face]
+    lift = terminator_offset(flat, weight, faces.positions[corner], faces.normals[corner])
+    position = flat + clearance[touched.face, None] * normal
+    position += _free_lift(scene, position, lift, 0.5 * size, device)
 
     grid = (resolution, resolution)
     mesh = faces.mesh[touched.face]
@@ -61,7 +80,7 @@ def rasterise_texels(scene: Scene, resolution: int) -> TexelMap:
 
     return TexelMap(
         state=spread(np.full(len(mesh), TexelState.VALID), np.uint8),
-        position=spread(position + lift, np.float32),
+        position=spread(position, np.float32),
         normal=spread(normal, np.float32),
         shading_normal=spread(bent_normals(shading, normal), np.float32),
         alpha=spread(_alpha(scene, mesh, np.einsum("sc,scd->sd", weight, faces.uv[corner])), np.float32),
@@ -79,6 +98,18 @@ def terminator_offset(position: Floats, weight: Floats, corners: Floats, normals
     """
     below = np.minimum(0.0, np.einsum("scd,scd->sc", position[:, None] - corners, normals))
     return np.asarray(-np.einsum("sc,scd->sd", weight * below, normals))
+
+
+def _free_lift(scene: Scene, position: Floats, lift: Floats, longest: Floats, device: Device) -> Floats:
+    """Offsets [S, 3] cut to `longest` [S] metres, and to half of the way to the first surface that they would meet."""
+    length = np.linalg.norm(lift, axis=1)
+    moved = np.flatnonzero(length > 0.0)
+    out = np.zeros_like(lift)
+    if len(moved):
+        direction, reach = lift[moved] / length[moved, None], np.minimum(length[moved], longest[moved])
+        met = BareTriangles(scene, device).nearest(position[moved], direction, 2.0 * reach).distance
+        out[moved] = direction * np.minimum(reach, 0.5 * met)[:, None]
+    return out
 
 
 def bent_normals(shading: Floats, geometric: Floats) -> Floats:
@@ -158,6 +189,12 @@ class _AllFaces:
         texels = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
         # A face of less than a hundredth of a texel is as good as one texel wide.
         return np.asarray(np.sqrt(area / np.where(texels > 0.01, texels, 1.0)))
+
+    def heights(self) -> Floats:
+        """Metres [F, 3] from each corner to the opposite edge."""
+        points = self.positions[self.corners]
+        edges = np.linalg.norm(points[:, [2, 0, 1]] - points[:, [1, 2, 0]], axis=2)
+        return np.asarray(2.0 * face_areas(self.positions, self.corners)[:, None] / np.maximum(edges, 1e-300))
 
     def charts(self) -> Ints:
         """Chart number of each face: connected over edges whose ends agree in mesh, place and light-map UV."""

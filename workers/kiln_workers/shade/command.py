@@ -18,6 +18,7 @@ from kiln_workers.render.backend import select_variant
 from kiln_workers.scene.environment import read_environment
 from kiln_workers.scene.load import check_light, load_scene
 from kiln_workers.scene.model import Environment, Scene
+from kiln_workers.scene.sheets import part_sheets
 from kiln_workers.shade.gbuffer import render_gbuffer
 from kiln_workers.shade.image_files import check_output, write_picture
 from kiln_workers.shade.image_metrics import compare_pictures, flip_noise_floor, psnr
@@ -98,7 +99,7 @@ def read_scene(path: Path, env: Path | None, scale: float, rotation_deg: float) 
         raise InputError("there is no such file", where=str(path))
     if not (math.isfinite(scale) and scale >= 0.0 and math.isfinite(rotation_deg)):
         raise InputError("must be finite, the scale not negative", where="--env-scale, --env-rotation")
-    scene = load_scene(path.parent, path.name)
+    scene = part_sheets(load_scene(path.parent, path.name))
     if env is None:
         return scene
     try:

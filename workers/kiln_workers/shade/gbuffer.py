@@ -13,8 +13,10 @@ from kiln_schemas.camera import Camera
 from kiln_workers.render.backend import Device, select_variant
 from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.mitsuba_scene import mesh_number
-from kiln_workers.render.paths import PathTracer
+from kiln_workers.render.paths import PathTracer, off_surface
 from kiln_workers.scene.model import Float32, Mesh, Scene
+from kiln_workers.scene.origin import local_camera
+from kiln_workers.scene.precision import face_clearance
 from kiln_workers.shade import material
 from kiln_workers.shade.camera import pixel_directions
 
@@ -57,6 +59,7 @@ def render_gbuffer(
 ) -> GBuffer:
     """The G-buffer of a scene whose meshes have light-map UVs, with `grid`^2 samples a pixel."""
     select_variant(device)
+    camera = local_camera(camera, scene.origin)
     directions = pixel_directions(camera, width, height, grid).astype(np.float32)
     flat = directions.reshape(-1, 3)
     tracer = PathTracer(scene, max_depth=0)
@@ -82,19 +85,22 @@ class _Vertices:
     face_normal: Floats  # [P, 3] unit
     uv: Floats  # [P, 2]
     lightmap_uv: Floats  # [P, 2]
+    clearance: Floats  # [P] metres
 
 
 def _interpolated(scene: Scene, mesh: Ints, face: Ints, position: Float32) -> _Vertices:
     """Attributes at points [P, 3] that lie on triangles `face` [P] of meshes `mesh` [P]."""
     count = len(mesh)
-    out = _Vertices(position.astype(np.float64), *(np.zeros((count, size)) for size in (3, 3, 2, 2)))
+    normal, face_normal, uv, lightmap_uv = (np.zeros((count, size)) for size in (3, 3, 2, 2))
+    out = _Vertices(position.astype(np.float64), normal, face_normal, uv, lightmap_uv, np.zeros(count))
     for number in np.unique(mesh):
         at = mesh == number
         one = scene.meshes[number]
         corners = one.faces[face[at]]
+        out.clearance[at] = face_clearance(one.positions, corners)
         weights, out.face_normal[at] = barycentric(one, corners, out.position[at])
-        normal = np.einsum("pk,pkc->pc", weights, one.normals[corners].astype(np.float64))
-        out.normal[at] = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
+        mean = np.einsum("pk,pkc->pc", weights, one.normals[corners].astype(np.float64))
+        out.normal[at] = mean / np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), 1e-30)
         for target, values in ((out.uv, one.uv), (out.lightmap_uv, one.lightmap_uv)):
             if values is not None:
                 target[at] = np.einsum("pk,pkc->pc", weights, values[corners].astype(np.float64))
@@ -140,15 +146,19 @@ def _gbuffer(
         alpha=np.square(reflectance.roughness),
         emission=np.where(seen[:, None], reflectance.emission, 0.0).astype(np.float32),
         reflects=seen,
-        specular_escapes=_escapes(tracer, surface.position, face_normal, normal, view),
+        specular_escapes=_escapes(tracer, surface.position, surface.clearance, face_normal, normal, view),
     )
 
 
-def _escapes(tracer: PathTracer, position: Floats, face_normal: Floats, normal: Floats, view: Float32) -> Bools:
+def _escapes(
+    tracer: PathTracer, position: Floats, clearance: Floats, face_normal: Floats, normal: Floats, view: Float32
+) -> Bools:
     """Whether rays from points [P, 3] in their specular directions leave the scene; never into the surface itself."""
     specular = 2.0 * np.einsum("pc,pc->p", normal, view)[:, None] * normal - view
     p, n, d = (np.ascontiguousarray(values.T.astype(np.float32)) for values in (position, face_normal, specular))
     direction = mi.Vector3f(d)
-    ray = mi.Ray3f(tracer.leave(mi.Point3f(p), mi.Normal3f(n), direction), direction)
+    ray = mi.Ray3f(
+        off_surface(mi.Point3f(p), mi.Normal3f(n), direction, mi.Float(clearance.astype(np.float32))), direction
+    )
     above = dr.dot(mi.Normal3f(n), direction) > 0.0
     return np.array(above & ~tracer.blocked(ray, above)).astype(bool)

@@ -35,6 +35,7 @@ from kiln_workers.package import ktx2
 from kiln_workers.package.half import layers_to_lobes
 from kiln_workers.scene.gltf import read_gltf
 from kiln_workers.scene.model import Scene
+from kiln_workers.scene.origin import about_own_centre
 from kiln_workers.shade import algorithm, textures
 
 Float32 = npt.NDArray[np.float32]
@@ -125,7 +126,7 @@ class ShadePackage:
     @classmethod
     def of(cls, folder: Path, manifest: Manifest, device: torch.device) -> Self:
         """The same of a package whose manifest is not written yet."""
-        scene = read_gltf(folder, SCENE_GLB)
+        scene = about_own_centre(read_gltf(folder, SCENE_GLB))
         for mesh in scene.meshes:
             if mesh.lightmap_uv is None:
                 raise InputError("has no TEXCOORD_1", where=f"{folder / SCENE_GLB}: {mesh.name}")

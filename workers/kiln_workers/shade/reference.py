@@ -13,6 +13,7 @@ from kiln_workers.render.backend import Device, select_variant
 from kiln_workers.render.jit import mi
 from kiln_workers.render.mitsuba_scene import to_mitsuba
 from kiln_workers.scene.model import Float32, Scene
+from kiln_workers.scene.origin import local_camera
 
 SAMPLES_A_PASS = 1 << 24
 """Paths of one wavefront: bounds the memory."""
@@ -49,6 +50,7 @@ def path_trace(
 ) -> Reference:
     """Render with `samples` paths a pixel, half of them in each half; `max_depth` scattering events at most."""
     select_variant(device)
+    camera = local_camera(camera, scene.origin)
     translated = to_mitsuba(scene)
     sensor = mi.load_dict(
         {

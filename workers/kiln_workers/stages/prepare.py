@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -13,9 +14,11 @@ from kiln_workers.render.between import between_maps
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import pack_scene, scene_hash
 from kiln_workers.scene.atlas import make_lightmap
+from kiln_workers.scene.lamps import lamp_notes
 from kiln_workers.scene.limits import LAYOUT_S, deadline
 from kiln_workers.scene.load import check_light, load_scene
 from kiln_workers.scene.model import Scene
+from kiln_workers.scene.sheets import part_sheets
 from kiln_workers.scene.texel_map import COARSE, SPECK, TexelMap, pack_texel_map, speck_share
 from kiln_workers.scene.texels import build_texel_map
 from kiln_workers.stages.tiles import plan_tiles
@@ -43,7 +46,8 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
     step(0)
     folder = _lay_out(bundle, context)
     step(1)
-    scene = check_light(load_scene(folder, bundle.entry, bundle.environment))
+    scene = part_sheets(check_light(load_scene(folder, bundle.entry, bundle.environment)))
+    scene = replace(scene, notes=(*scene.notes, *lamp_notes(scene)))
     step(2)
     with deadline(LAYOUT_S, bundle.entry, "give a light map", "Simplify it, or give it a light-map UV (TEXCOORD_1)."):
         lightmap = make_lightmap(scene, settings.lightmap)

@@ -15,7 +15,7 @@ from kiln_workers.render.tile import TexelBatch, TileRenderer
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import unpack_scene
 from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
-from kiln_workers.stages.tiles import BACK_FACE_LIMIT, covered_texels, map_coordinates
+from kiln_workers.stages.tiles import covered_texels, map_coordinates
 from kiln_workers.store.light_field import LightFieldStore
 
 Float16 = npt.NDArray[np.float16]
@@ -49,7 +49,7 @@ def run(payload: RenderPayload, context: Context) -> RenderResult:
         warm.store.write_between(tile, inside, between)
         paths += more
     warm.store.check()
-    invalid = inside[images.back_faces > BACK_FACE_LIMIT]
+    invalid = inside[images.enclosed]
     return RenderResult(
         tile=tile,
         paths=paths,

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -11,9 +10,6 @@ from kiln_schemas.tasks import RenderResult, Tile
 from kiln_workers.scene.texel_map import TexelMap, TexelState
 
 Ints = npt.NDArray[np.int64]
-
-BACK_FACE_LIMIT: Final = 0.5
-"""A texel of whose primary rays more than this fraction meet a back face lies inside something: it is invalid."""
 
 
 def plan_tiles(texel_map: TexelMap, size: int) -> tuple[Tile, ...]:
@@ -42,8 +38,13 @@ def map_coordinates(tile: Tile, inside: Ints) -> tuple[Ints, Ints]:
 
 
 def with_render_verdict(texel_map: TexelMap, renders: Iterable[RenderResult]) -> TexelMap:
-    """The texel map with the texels that rendering found inside other geometry marked invalid."""
+    """The texel map with the texels that rendering found inside other geometry marked invalid.
+
+    A chart that lies inside as a whole has nothing to be filled from: it stays as it is.
+    """
     state = texel_map.state.copy()
     for render in renders:
         state[map_coordinates(render.tile, np.asarray(render.invalid_texels, dtype=np.int64))] = TexelState.INVALID
+    somewhere = np.unique(texel_map.chart[state == TexelState.VALID])
+    state[(state == TexelState.INVALID) & ~np.isin(texel_map.chart, somewhere)] = TexelState.VALID
     return replace(texel_map, state=state)

@@ -9,6 +9,12 @@ const STEP = 0.02; // of the scene's size a key press
 const MOVES = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] };
 const TURNS = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
+// A camera in the file's coordinates, about the origin that the meshes are drawn about.
+export function localCamera(camera, origin) {
+  const less = (point) => point.map((value, axis) => value - origin[axis]);
+  return { ...camera, position: less(camera.position), target: less(camera.target) };
+}
+
 // From `#camera=px,py,pz:tx,ty,tz:fov`, as `lightkiln shade` takes it; null where there is none.
 export function readCamera(hash) {
   const number = "(-?[0-9.]+)";

@@ -34,7 +34,7 @@ export async function openPackage(folder, told = () => {}) {
   return {
     manifest,
     bytes,
-    meshes: await readMeshes(glb),
+    ...(await readMeshes(glb)),
     textures: Object.fromEntries(Object.entries(textures).map(([name, texture]) => [name, upload(texture, name)])),
     shaders: Object.fromEntries(SHADERS.map((name, index) => [name, shaders[index]])),
   };
@@ -121,16 +121,20 @@ function half(texture) {
   return texture;
 }
 
-// The meshes of scene.glb, in world space, as glTF's own materials describe them.
+// The meshes of scene.glb as glTF's own materials describe them, and where the file has their (0, 0, 0): a scene far from the
+// origin is drawn about a point amid it, because 32 bits do not resolve its own coordinates.
 async function readMeshes(glb) {
   const { scene } = await new GLTFLoader().parseAsync(glb, "").catch((error) => {
     throw new PackageError(`scene.glb cannot be read: ${error.message}.`);
   });
   const meshes = [];
+  const moved = scene.getObjectByName("origin");
+  const origin = moved && !moved.isMesh ? moved.position.toArray() : [0, 0, 0];
+  if (moved && !moved.isMesh) moved.position.set(0, 0, 0);
   scene.updateMatrixWorld(true);
   scene.traverse((node) => node.isMesh && meshes.push(node));
   for (const mesh of meshes) {
     if (!mesh.geometry.attributes.uv1) throw new PackageError(`scene.glb: '${mesh.name}' has no light-map coordinates (TEXCOORD_1).`);
   }
-  return meshes;
+  return { meshes, origin };
 }

@@ -1,5 +1,7 @@
 // A path-traced picture over the part of the drawn one right of a slider; packages whose jobs stated FLIP gates hold some.
 
+import { localCamera } from "./navigation.js";
+
 const WHITE = 2; // where lightkiln's tone map puts a picture's white, in Reinhard's units
 
 export class Reference {
@@ -27,7 +29,7 @@ export class Reference {
     if (!this.view) return false;
     const name = encodeURIComponent(this.controls.view.value);
     this.panel.firstElementChild.src = `${document.body.dataset.package}gates/${name}_reference.png`;
-    this.picture.setCamera(this.view.camera);
+    this.picture.setCamera(localCamera(this.view.camera, this.picture.opened.origin));
     this.controls.tone.value = "reinhard";
     return true;
   }

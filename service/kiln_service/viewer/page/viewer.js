@@ -2,7 +2,7 @@
 
 import { firstCamera } from "./first_camera.js";
 import { lackingSwitches } from "./material.js";
-import { Navigation, readCamera } from "./navigation.js";
+import { Navigation, localCamera, readCamera } from "./navigation.js";
 import { PackageError, openPackage } from "./package.js";
 import { Picture } from "./picture.js";
 import { Reference } from "./reference.js";
@@ -23,7 +23,8 @@ export async function start() {
   const picture = new Picture(canvas, opened);
   const [stated] = Object.values(opened.manifest.views ?? {});
   const first = () => firstCamera(opened.meshes, picture.bounds, canvas.clientWidth / Math.max(canvas.clientHeight, 1));
-  picture.setCamera(readCamera(location.hash) ?? stated?.camera ?? first());
+  const given = readCamera(location.hash) ?? stated?.camera;
+  picture.setCamera(given ? localCamera(given, opened.origin) : first());
   form.hidden = false;
   offerControls(picture);
   const reference = new Reference(picture, form);
