@@ -3,7 +3,7 @@
 Materials become `kiln_gltf` (see `gltf_bsdf`), glTF's own surface. The back of a single-sided material reflects
 nothing: it is the inside of a solid. The environment's rows are doubled, because Mitsuba puts the first row at the pole
 and `scene.model` half a row below it; on the doubled grid both agree at every row. A double-sided emitter becomes two
-sheets back to back. Spot lights fall off linearly in the angle between their cones, which glTF leaves open.
+sheets back to back.
 """
 
 from typing import Any, Final
@@ -248,17 +248,13 @@ def _light(light: PunctualLight, weight: float) -> dict[str, Any]:
         return {"type": "directional", "direction": travel, "irradiance": intensity, "sampling_weight": weight}
     if light.kind is LightKind.POINT:
         return {"type": "point", "position": list(light.position), "intensity": intensity, "sampling_weight": weight}
-    origin, direction = np.asarray(light.position, np.float64), np.asarray(light.direction, np.float64)
-    up = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    outer = float(np.degrees(light.outer_cone))
     return {
-        "type": "spot",
-        "to_world": mi.ScalarTransform4f().look_at(
-            origin=origin.tolist(), target=(origin + direction).tolist(), up=up.tolist()
-        ),
-        "intensity": intensity,
-        "cutoff_angle": outer,
-        "beam_width": min(float(np.degrees(light.inner_cone)), 0.999 * outer),
+        "type": "kiln_spot",
+        **{channel: float(value) for channel, value in zip(("red", "green", "blue"), light.intensity, strict=True)},
+        "position": mi.ScalarPoint3f(*light.position),
+        "direction": mi.ScalarVector3f(*light.direction),
+        "inner_cone": float(light.inner_cone),
+        "outer_cone": float(light.outer_cone),
         "sampling_weight": weight,
     }
 
