@@ -29,6 +29,8 @@ def add_commands(commands: Any) -> None:
     tracing.add_argument("--env-scale", type=float, default=1.0)
     tracing.add_argument("--env-rotation", type=float, default=0.0, help="degrees about +Y")
     tracing.add_argument("--samples", type=_positive, default=256, help="paths a pixel, both halves together")
+    tracing.add_argument("--noise", type=_luminance, help="trace until the RMS noise over the mean is at most this")
+    tracing.add_argument("--most-samples", type=_positive, default=16384, help="paths a pixel at most, with --noise")
     tracing.add_argument("--max-depth", type=_positive, default=12, help="scattering events of a path")
     tracing.add_argument("--seed", type=_natural, default=0)
     tracing.set_defaults(command=_run_reference)

@@ -24,7 +24,7 @@ from kiln_workers.shade.image_files import check_output, write_picture
 from kiln_workers.shade.image_metrics import compare_pictures, flip_noise_floor, psnr
 from kiln_workers.shade.package import ShadePackage, read_exr
 from kiln_workers.shade.picture import shade
-from kiln_workers.shade.reference import path_trace
+from kiln_workers.shade.reference import ReferenceTracer
 from kiln_workers.shade.stored import StoredImages
 from kiln_workers.shade.term import Term
 
@@ -72,9 +72,11 @@ def run_reference(options: argparse.Namespace) -> int:
     camera, (width, height), out = read_camera(options.camera), parse_size(options.size), check_output(options.out)
     scene = check_light(read_scene(options.scene, options.env, options.env_scale, options.env_rotation))
     began = time.perf_counter()
-    made = path_trace(
-        scene, camera, width, height, options.samples, options.max_depth, options.seed, device=options.device
-    )
+    tracer = ReferenceTracer(scene, camera, width, height, options.max_depth, options.device)
+    if options.noise is None:
+        made = tracer.render(options.samples, options.seed)
+    else:
+        made = tracer.render_until(options.noise, options.samples, options.most_samples, options.seed)
     white = options.white or colour.white_point(made.picture)
     write_picture(out, made.picture, white)
     told = {
@@ -85,6 +87,7 @@ def run_reference(options: argparse.Namespace) -> int:
         "max_depth": options.max_depth,
         "psnr_of_halves": _finite(psnr(*made.halves, white)),
         "rms_noise": made.rms_noise,
+        "noise_reached": options.noise is None or made.rms_noise <= options.noise,
         "flip_noise_floor": round(float(flip_noise_floor(made.halves).mean()), 5),
         "white": white,
         "seconds": round(time.perf_counter() - began, 3),
@@ -157,3 +160,5 @@ def _tell(told: dict[str, Any], as_json: bool) -> None:
     for key, sentence in words.items():
         if key in told:
             print(sentence.format(told[key]))
+    if not told.get("noise_reached", True):
+        print(f"The noise that was asked for is not reached with {told['samples']} paths a pixel (--most-samples).")

@@ -1,22 +1,29 @@
-"""A path-traced picture of a scene, by Mitsuba's own `path` integrator, and how noisy it is.
+"""A path-traced picture of a scene, by Mitsuba's own `volpath` integrator, and how noisy it is.
 
 Independent of the tracer that bakes: only the scene's translation is shared. Two halves with different seeds are
-rendered; the picture is their mean, and half their difference estimates its noise.
+rendered; the picture is their mean, and half their difference estimates its noise. `volpath` and not `path`, because
+its shadow rays pass through what is cut out of a surface. Mitsuba's rays start a distance off a surface that suits a
+scene of metres, so a small scene is enlarged first: radiance does not change with the unit of length.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 
 from kiln_schemas.camera import Camera
 from kiln_workers.render.backend import Device, select_variant
 from kiln_workers.render.jit import mi
-from kiln_workers.render.mitsuba_scene import to_mitsuba
-from kiln_workers.scene.model import Float32, Scene
-from kiln_workers.scene.origin import local_camera
+from kiln_workers.render.mitsuba_scene import scene_diagonal, to_mitsuba
+from kiln_workers.scene.model import Float32, LightKind, PunctualLight, Scene
+from kiln_workers.scene.origin import Point, local_camera
 
-SAMPLES_A_PASS = 1 << 24
+SAMPLES_A_PASS: Final = 1 << 24
 """Paths of one wavefront: bounds the memory."""
+
+LEAST_DIAGONAL: Final = 64.0
+"""Metres; Mitsuba keeps 1e-4 (1 + the coordinate) off surfaces, which is little from here on."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +44,15 @@ class Reference:
         noise = 0.5 * (self.halves[0].astype(np.float64) - self.halves[1])
         return float(np.sqrt(np.mean(np.square(noise))) / max(float(self.picture.mean()), 1e-30))
 
+    def joined(self, other: "Reference") -> "Reference":
+        """Both references' paths together."""
+        total = self.samples + other.samples
+        halves = tuple(
+            ((self.samples * a.astype(np.float64) + other.samples * b) / total).astype(np.float32)
+            for a, b in zip(self.halves, other.halves, strict=True)
+        )
+        return Reference((halves[0], halves[1]), total)
+
 
 def path_trace(
     scene: Scene,
@@ -49,16 +65,89 @@ def path_trace(
     device: Device = "auto",
 ) -> Reference:
     """Render with `samples` paths a pixel, half of them in each half; `max_depth` scattering events at most."""
-    select_variant(device)
-    camera = local_camera(camera, scene.origin)
-    translated = to_mitsuba(scene)
-    sensor = mi.load_dict(
+    return ReferenceTracer(scene, camera, width, height, max_depth, device).render(samples, seed)
+
+
+class ReferenceTracer:
+    """A scene and a camera, translated once for any number of renders."""
+
+    def __init__(
+        self, scene: Scene, camera: Camera, width: int, height: int, max_depth: int, device: Device = "auto"
+    ) -> None:
+        select_variant(device)
+        scene, camera = enlarged(scene, local_camera(camera, scene.origin))
+        self._scene = to_mitsuba(scene)
+        self._sensor = _sensor(camera, width, height)
+        self._integrator = mi.load_dict({"type": "volpath", "max_depth": max_depth + 1})
+        self._shape = (height, width, 3)
+
+    def render(self, samples: int, seed: int = 0) -> Reference:
+        """`samples` paths a pixel, half of them in each half; another seed has other paths."""
+        height, width, _ = self._shape
+        each = max(1, samples // 2)
+        passes = max(1, -(-each * width * height // SAMPLES_A_PASS))
+        halves = []
+        for half in range(2):
+            total = np.zeros(self._shape, np.float64)
+            counts = [each // passes + (number < each % passes) for number in range(passes)]
+            for number, count in enumerate(counts):
+                if count:
+                    key = (seed * 2 + half) * passes + number
+                    picture = mi.render(
+                        self._scene, sensor=self._sensor, integrator=self._integrator, spp=count, seed=key
+                    )
+                    total += count * np.asarray(picture, np.float64)
+            halves.append((total / each).astype(np.float32))
+        return Reference((halves[0], halves[1]), 2 * each)
+
+    def render_until(
+        self, noise: float, samples: int, most: int, seed: int = 0, on_round: Callable[[Reference], None] | None = None
+    ) -> Reference:
+        """Rounds of paths, each as many as all before, until `rms_noise` is at most `noise` or `most` are traced."""
+        found = self.render(min(samples, most), seed)
+        rounds = 0
+        while found.rms_noise > noise and found.samples < most:
+            if on_round:
+                on_round(found)
+            rounds += 1
+            # Seeds of rounds lie beyond those that other pictures are asked for.
+            more = self.render(min(found.samples, most - found.samples), seed + (rounds << 20))
+            found = found.joined(more)
+        return found
+
+
+def enlarged(scene: Scene, camera: Camera) -> tuple[Scene, Camera]:
+    """Both at a scale (a power of two) at which the scene's diagonal is at least `LEAST_DIAGONAL`."""
+    factor = 2.0 ** max(0.0, np.ceil(np.log2(LEAST_DIAGONAL / scene_diagonal(scene))))
+    if factor == 1.0:
+        return scene, camera
+    meshes = tuple(replace(mesh, positions=mesh.positions * np.float32(factor)) for mesh in scene.meshes)
+    lights = tuple(_enlarged_light(light, factor) for light in scene.lights)
+    moved = {"position": _times(camera.position, factor), "target": _times(camera.target, factor)}
+    return replace(scene, meshes=meshes, lights=lights), camera.model_copy(update=moved)
+
+
+def _enlarged_light(light: PunctualLight, factor: float) -> PunctualLight:
+    """The light farther away; its intensity keeps what arrives, unless it comes from infinity."""
+    if light.kind is LightKind.DIRECTIONAL:
+        return light
+    intensity = _times(light.intensity, factor * factor)
+    return replace(light, position=_times(light.position, factor), intensity=intensity)
+
+
+def _times(point: tuple[float, float, float], factor: float) -> Point:
+    x, y, z = (factor * value for value in point)
+    return x, y, z
+
+
+def _sensor(camera: Camera, width: int, height: int) -> Any:
+    return mi.load_dict(
         {
             "type": "perspective",
             "fov": camera.fov_deg,
             "fov_axis": "y",
             "near_clip": 1e-3,
-            "far_clip": 1e6,
+            "far_clip": 1e7,
             "to_world": mi.ScalarTransform4f().look_at(
                 origin=list(camera.position), target=list(camera.target), up=list(camera.up)
             ),
@@ -73,17 +162,3 @@ def path_trace(
             "sampler": {"type": "independent"},
         }
     )
-    integrator = mi.load_dict({"type": "path", "max_depth": max_depth + 1})
-    each = max(1, samples // 2)
-    passes = max(1, -(-each * width * height // SAMPLES_A_PASS))
-    halves = []
-    for half in range(2):
-        total = np.zeros((height, width, 3), np.float64)
-        counts = [each // passes + (number < each % passes) for number in range(passes)]
-        for number, count in enumerate(counts):
-            if count:
-                key = (seed * 2 + half) * passes + number
-                picture = mi.render(translated, sensor=sensor, integrator=integrator, spp=count, seed=key)
-                total += count * np.asarray(picture, np.float64)
-        halves.append((total / each).astype(np.float32))
-    return Reference((halves[0], halves[1]), 2 * each)
