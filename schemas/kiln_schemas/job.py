@@ -120,6 +120,8 @@ class JobView(Contract):
     """Texels along each side of the light map; None as long as it is `auto` and not chosen."""
     renders_of: Id | None = None
     """The job whose light fields it uses, where they are the same; nothing was rendered again then."""
+    waits_for: Note | None = None
+    """Why no worker has a task of it, in a sentence; None while one has, or where one is about to take the next."""
 
 
 class JobPage(Contract):

@@ -14,6 +14,7 @@ from kiln_service import transitions
 from kiln_service.clock import DatabaseClock
 from kiln_service.db import Database, TaskRow, Tx
 from kiln_service.operators import FORGOTTEN_S
+from kiln_service.waiting import REFUSED_S
 from kiln_service.work import Work, locked_task
 
 log = logging.getLogger(__name__)
@@ -35,6 +36,7 @@ async def reap(database: Database, work: Work, stale_s: float, clock: DatabaseCl
 async def forget_workers(database: Database) -> int:
     """Forget registrations that were not heard of for so long that lists leave them out; how many."""
     async with database.transaction() as tx:
+        await tx.run("forget_refused_workers", seconds=REFUSED_S)
         return await tx.count("forget_workers", forgotten_s=FORGOTTEN_S)
 
 

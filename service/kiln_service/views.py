@@ -12,9 +12,11 @@ from kiln_schemas.errors import InputError, InternalError, NotFound
 from kiln_schemas.job import CurveView, JobPage, JobView, StageView, TaskView
 from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
+from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, JobRow, TaskRow, Tx, job_rows, readable, readable_rows
 from kiln_service.db.lenient import note_unreadable
 from kiln_service.planner import METHODS
+from kiln_service.waiting import reasons
 
 LEAST_FRACTION: Final = 0.05
 """A running task says nothing about its duration before this."""
@@ -24,13 +26,13 @@ CURVE_POINTS: Final = 1000
 """About the most points of the curve of a task that runs."""
 
 
-async def job_view(database: Database, job_id: str) -> JobView:
+async def job_view(database: Database, config: ServiceConfig, job_id: str) -> JobView:
     """One job; NotFound where there is none."""
     async with database.transaction() as tx:
         row = await tx.maybe("find_job", id=job_id)
         if row is None:
             raise NotFound(f"no job '{job_id}'", where="job")
-        found = await _views(tx, [JobRow.of(row)])
+        found = await _views(tx, config, [JobRow.of(row)])
     if not found:
         raise InternalError(f"job {job_id} cannot be read", where="job", remedy="The coordinator's log says why.")
     return found[0]
@@ -38,6 +40,7 @@ async def job_view(database: Database, job_id: str) -> JobView:
 
 async def job_page(
     database: Database,
+    config: ServiceConfig,
     *,
     states: Sequence[JobState] = (),
     labels: Mapping[str, str] | None = None,
@@ -58,7 +61,7 @@ async def job_page(
             text=text,
             limit=limit + 1,
         )
-        views = await _views(tx, job_rows(rows[:limit]))
+        views = await _views(tx, config, job_rows(rows[:limit]))
     return JobPage(jobs=tuple(views), next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
 
@@ -166,21 +169,22 @@ def _remaining_of_kind(row: DictRow) -> float | None:
     return float(max((sum(parts) + idle) / max(len(running), 1), max(parts, default=0.0), 0.0))
 
 
-async def _views(tx: Tx, jobs: Sequence[JobRow]) -> list[JobView]:
+async def _views(tx: Tx, config: ServiceConfig, jobs: Sequence[JobRow]) -> list[JobView]:
     """Those that can be shown."""
     by_job: dict[str, dict[str, DictRow]] = {job.id: {} for job in jobs}
     for row in await tx.all("stages", job_ids=list(by_job)):
         by_job[row["job_id"]][row["kind"]] = row
+    waits = await reasons(tx, config, jobs, by_job)
     views = []
     for job in jobs:
         try:
-            views.append(_job_view(job, by_job[job.id]))
+            views.append(_job_view(job, by_job[job.id], waits.get(job.id)))
         except (ValidationError, KeyError) as error:
             note_unreadable("job", {"id": job.id}, error)
     return views
 
 
-def _job_view(job: JobRow, rows: dict[str, DictRow]) -> JobView:
+def _job_view(job: JobRow, rows: dict[str, DictRow], waits_for: str | None) -> JobView:
     ordered = [rows[kind] for kind in METHODS[job.method].stages if kind in rows]
     values = {
         "id": job.id,
@@ -205,6 +209,7 @@ def _job_view(job: JobRow, rows: dict[str, DictRow]) -> JobView:
         "submitter": job.submitter,
         "lightmap_side": job.lightmap_side,
         "renders_of": job.renders_of,
+        "waits_for": waits_for,
     }
     return readable(JobView, values)
 

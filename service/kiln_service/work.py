@@ -7,6 +7,7 @@ Everything that a commit causes (the result, the next stage's release, the job's
 transaction under the job's lock, so the last tile's fan-in happens once.
 """
 
+import asyncio
 import hmac
 import secrets
 import time
@@ -74,6 +75,9 @@ class Work:
         Conflict where it is of another version than this coordinator, TooMany where the token has too many already.
         """
         if registration.version != __version__:
+            about = {"owner": owner, "name": registration.name, "version": registration.version}
+            async with self._database.transaction() as tx:
+                await tx.run("note_refused_worker", **about, most=self._config.limits.workers)
             raise Conflict(
                 f"the worker is lightkiln {registration.version}, the coordinator {__version__}",
                 where="version",
@@ -277,7 +281,8 @@ class Work:
             prepared = result.model_dump(mode="json", exclude={"tiles", "placements"})
             await tx.run("set_prepared", id=job.id, prepared=Jsonb(prepared))
             try:
-                planned = plan_after_prepare(result, job.settings, job.gates, self._config.limits.tiles)
+                most = self._config.limits.tiles
+                planned = await asyncio.to_thread(plan_after_prepare, result, job.settings, job.gates, most)
             except InputError as error:
                 await transitions.fail_job(tx, job, error.problem(), transitions.COORDINATOR)
                 return

@@ -51,7 +51,7 @@ async def submit(
     """Submit a bake of files that were uploaded before."""
     job = await jobs.submit(parts.database, parts.config, request, who, idempotency_key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
-    return await views.job_view(parts.database, job.id)
+    return await views.job_view(parts.database, parts.config, job.id)
 
 
 @router.get("/jobs", dependencies=[Reader], responses=problems(422))
@@ -71,6 +71,7 @@ async def list_jobs(
     size = min(limit, parts.config.limits.page)
     return await views.job_page(
         parts.database,
+        parts.config,
         states=state or (),
         labels=read_labels(label or (), "label"),
         text=q,
@@ -82,7 +83,7 @@ async def list_jobs(
 @router.get("/jobs/{job_id}", dependencies=[Reader], responses=problems(404))
 async def job(job_id: str, parts: PartsHere) -> JobView:
     """One job with its stages, the time left, its quality gates and, if it failed, why."""
-    return await views.job_view(parts.database, job_id)
+    return await views.job_view(parts.database, parts.config, job_id)
 
 
 @router.post("/jobs/{job_id}/cancel", response_model=JobView, responses=problems(404, 409) | UNSEEN)
@@ -280,7 +281,7 @@ async def _seen(parts: Parts, job_id: str, who: Principal) -> JobView | Response
     """The job as it is now, where the caller may look at jobs."""
     if not who.scopes & {Scope.READ, Scope.ADMIN}:
         return Response(status_code=204)
-    return await views.job_view(parts.database, job_id)
+    return await views.job_view(parts.database, parts.config, job_id)
 
 
 async def _event_list(parts: Parts, job_id: str, page: list[EventView], limit: int) -> AsyncIterator[str]:

@@ -301,6 +301,8 @@ def status(
         return
     left = f", about {duration(view.remaining_s)} left" if view.remaining_s is not None else ""
     results.print(f"{view.name}: {view.state.value}{left}", markup=False)
+    if view.waits_for is not None:
+        results.print(view.waits_for, markup=False, soft_wrap=True)
     results.print(stage_table(view))
     for result in view.gate_results:
         results.print(f"gate: {result.sentence()}", markup=False, soft_wrap=True)

@@ -28,6 +28,8 @@ MOST_CELLS: Final = 64
 CURVE_WIDTH: Final = 64
 LINE_S: Final = 10.0
 """Between two lines where there is no terminal."""
+SETTLED_S: Final = 5.0
+"""Why a job waits is shown after this: a worker that starts together with it takes a moment."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ class BarDisplay:
         head = f"{job.name}: {job.state.value}, elapsed {duration(time.monotonic() - self._began)}"
         if job.remaining_s is not None and job.state not in FINAL_JOB_STATES:
             head += f", about {duration(job.remaining_s)} left"
-        self._live.update(Group(Text(head), table, *self._drawn(job, seen)))
+        self._live.update(Group(Text(head), *map(Text, waits(job, self._began)), table, *self._drawn(job, seen)))
 
     def _drawn(self, job: JobView, seen: Pictures) -> Iterator[Text]:
         size = self._live.console.size
@@ -128,10 +130,19 @@ class LineDisplay:
         self._last, self._stages = now, active
         words = [f"{s.kind.value} {s.fraction:.0%} {counts(s)} {details(s, seen.curves)}".strip() for s in job.stages]
         left = "" if job.remaining_s is None else f", about {duration(job.remaining_s)} left"
-        self.say(f"[{duration(now - self._began)}] {job.state.value}: {'; '.join(words)}{left}")
+        said = [
+            f"[{duration(now - self._began)}] {job.state.value}: {'; '.join(words)}{left}",
+            *waits(job, self._began),
+        ]
+        self.say(". ".join(said))
 
     def say(self, message: str) -> None:
         notices.print(message, markup=False, soft_wrap=True)
+
+
+def waits(job: JobView, began: float) -> list[str]:
+    """Why no task of the job runs, where that is so and it has been followed for a moment (since `began`)."""
+    return [job.waits_for] if job.waits_for is not None and time.monotonic() - began >= SETTLED_S else []
 
 
 def counts(stage: StageView) -> str:

@@ -64,7 +64,7 @@ _ACTIONS: Final[Mapping[Action, tuple[Set[JobState], str, str]]] = {
 @router.get("/jobs/{job_id}", dependencies=[Reader])
 async def job(request: Request, job_id: str, parts: PartsHere) -> Response:
     """All about one job."""
-    view = await views.job_view(parts.database, job_id)
+    view = await views.job_view(parts.database, parts.config, job_id)
     async with parts.database.transaction() as tx:
         tasks = await tx.all("tasks_of_note", job_id=job_id, limit=TASKS)
         events = readable_rows(EventView, await tx.all("last_events", job_id=job_id, limit=EVENTS))

@@ -44,6 +44,7 @@ async def jobs(
     labels, text = _read_search(q)
     found = await views.job_page(
         parts.database,
+        parts.config,
         states=state or (),
         labels=labels,
         text=text or None,

@@ -26,6 +26,7 @@ SELECT job_id, kind,
        count(*) FILTER (WHERE state = 'active') AS active,
        count(*) FILTER (WHERE state = 'failed') AS failed,
        count(*) FILTER (WHERE state = 'soft-failed') AS soft_failed,
+       count(*) FILTER (WHERE state IN ('queued', 'soft-failed')) AS claimable,
        COALESCE(sum(extract(epoch FROM finished - started)) FILTER (WHERE state = 'completed'), 0)::float8 AS seconds,
        array_agg(COALESCE(LEAST(
                GREATEST(figure(progress -> 'done', 1e15), 0) / GREATEST(figure(progress -> 'total', 1e15), 1e-6), 1

@@ -58,7 +58,7 @@ def viewer_page(title: str, package: str) -> HTMLResponse:
 @router.get("/jobs/{job_id}/view", dependencies=[Depends(caller(Scope.READ))])
 async def view(job_id: str, parts: PartsHere) -> Response:
     """A job's package."""
-    job = await views.job_view(parts.database, job_id)
+    job = await views.job_view(parts.database, parts.config, job_id)
     return viewer_page(job.name, f"/v1/jobs/{job.id}/artifacts/")
 
 
