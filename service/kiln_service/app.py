@@ -42,7 +42,7 @@ from kiln_service.work import Work
 
 def create_app(config: ServiceConfig) -> FastAPI:
     """The application for a configuration whose `database` is set (`serve.py` starts the embedded one)."""
-    config.data.mkdir(parents=True, exist_ok=True)
+    config.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     tokens = TokenBook([own_token(config.data), *config.tokens])
     app = FastAPI(
         title="lightkiln",

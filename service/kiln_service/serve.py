@@ -14,6 +14,7 @@ import os
 import shutil
 import signal
 import socket
+import stat
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -223,10 +224,15 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 def _prepare_folder(data: Path) -> None:
+    """Make the data folder for its owner alone; one that others may read is left with a warning."""
     try:
-        data.mkdir(parents=True, exist_ok=True)
+        data.mkdir(parents=True, mode=0o700)
     except FileExistsError:
-        raise InputError("is not a folder", where=str(data), remedy="Choose another --data.") from None
+        if not data.is_dir():
+            raise InputError("is not a folder", where=str(data), remedy="Choose another --data.") from None
+        mode = stat.S_IMODE(data.stat().st_mode)
+        if mode & 0o077:
+            log.warning("%s has mode %04o: other users of the machine may read scenes and logs; chmod 700", data, mode)
     except OSError as error:
         raise MachineLacks(
             f"cannot make the data folder: {error.strerror}", where=str(data), remedy="Choose another --data."

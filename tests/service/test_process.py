@@ -278,6 +278,19 @@ def test_root_opens_no_folder_to_others(own_folder, monkeypatch):
         EmbeddedPostgres(private / "data" / "postgres").start()
 
 
+def test_the_data_folder_is_its_owners_alone(own_folder):
+    made = own_folder / "made" / "data"
+    with coordinator(made) as first:
+        assert stat.S_IMODE(made.stat().st_mode) == 0o700
+        _, errors = first.stop(signal.SIGTERM)
+    assert "other users" not in errors
+    made.chmod(0o755)
+    with coordinator(made) as second:
+        assert stat.S_IMODE(made.stat().st_mode) == 0o755, "what a person has set stays"
+        _, errors = second.stop(signal.SIGTERM)
+    assert errors.count("other users of the machine may read scenes and logs") == 1 and "mode 0755" in errors
+
+
 def test_nobody_else_can_hold_the_lock(folder):
     (folder / "lock").touch(mode=0o644)  # of an earlier version
     with coordinator(folder):

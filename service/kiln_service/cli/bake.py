@@ -263,7 +263,7 @@ def _make_room(options: BakeOptions, data: Path) -> None:
         shutil.rmtree(data, ignore_errors=True)
         remove_package(options.out)
         (options.out / RECORD).unlink(missing_ok=True)
-        data.mkdir(parents=True, exist_ok=True)
+        data.mkdir(parents=True, exist_ok=True, mode=0o700)
 
 
 def _is_done(out: Path, record: Record) -> bool:

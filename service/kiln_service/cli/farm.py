@@ -155,7 +155,8 @@ class LocalFarm:
         ]
 
     def __enter__(self) -> Self:
-        (self.data / "logs").mkdir(parents=True, exist_ok=True)
+        self.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+        (self.data / "logs").mkdir(exist_ok=True)
         self._config_file.write_text(json.dumps({"timing": LOCAL_TIMING}))
         return self
 
