@@ -24,7 +24,7 @@ LOG_BYTES: Final = 65536
 TAIL_BYTES: Final = 1 << 20
 """Most that the last line of a log may be."""
 BLOB_BYTES: Final = 1 << 20
-LISTED: Final = 2500
+LISTED: Final = 300
 """Most workers that are kept of one token."""
 
 
@@ -136,7 +136,7 @@ def useless_blobs(ground: Ground) -> Tally:
     """Blobs that nothing needs, until the token may upload no more: that is the attempt that has to be refused."""
     tally, refused, uploaded = Tally(), 0, 0
     for number in range(ground.many(96, 384)):
-        data = f"{ground.seed} {number} ".encode() * (BLOB_BYTES // 16)
+        data = f"{ground.seed:07d} {number:07d} ".encode() * (BLOB_BYTES // 16)
         reply = ground.send("submit", "PUT", f"/v1/blobs/{hashlib.sha256(data).hexdigest()}", content=data)
         status = 0 if reply is None else reply.status_code
         refused, uploaded = refused + (status >= 400), uploaded + (status < 400) * len(data)
@@ -202,7 +202,7 @@ def many_jobs(ground: Ground) -> Tally:
         for path in ("pause", "resume", "cancel"):
             reply = ground.send("submit", "POST", f"/v1/jobs/{job}/{path}")
             status = 0 if reply is None else reply.status_code
-            tally.count(status in (200, 409), f"{path}: {status}", status)
+            tally.count(status in (200, 204, 409), f"{path}: {status}", status)
     return tally
 
 

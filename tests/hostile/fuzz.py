@@ -79,7 +79,7 @@ def claimed(ground: Ground) -> Tally:
                 claim = following
     for job in jobs:
         status = ground.cancel(job)
-        tally.count(status in (200, 409), f"cancel afterwards: {status}", status)
+        tally.count(status in (200, 204, 409), f"cancel afterwards: {status}", status)
     return tally
 
 

@@ -57,8 +57,8 @@ ATTACKS: Final[Mapping[str, Attack]] = {
     "requests without a token": floods.unasked,
     "bad tokens": floods.bad_tokens,
 }
-CONFIG: Final[dict[str, Any]] = {}
-"""Of the coordinator: as an operator has it who configures nothing."""
+CONFIG: Final[dict[str, Any]] = {"limits": {"unused_bytes": 64 << 20, "workers": 256}}
+"""Of the coordinator: as an operator has it who configures nothing, but that blobs and workers are too many sooner."""
 MARKS: Final = ("<!-- begin of the table that make hostile writes -->", "<!-- end of the table -->")
 CALM_ROUNDS: Final = 20
 """Of the other client, and at least a whole bake, before the first attack."""

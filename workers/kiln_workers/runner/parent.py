@@ -50,6 +50,7 @@ STOP_GRACE_S: Final = 2.0
 """How long a child may take to leave a task that is not wanted before it is killed and has to load all anew."""
 FAREWELL_S: Final = 3.0
 """How long a worker that is told to stop tries to give its task back."""
+INTERRUPT_AGAIN_S: Final = 1.0
 PAUSE_MAX_S: Final = 30.0
 LOG_CHARACTERS: Final = 65536
 LAST_LINES: Final = 8
@@ -101,12 +102,13 @@ class Worker:
 
         Or until an operator drains the worker: it is told so when it asks for its next task.
         """
-        for sig in (signal.SIGTERM, signal.SIGINT):
+        for sig in (signal.SIGTERM, signal.SIGINT, signal.SIGALRM):
             signal.signal(sig, self._interrupt)
         try:
             while True:
                 self.step()
         except Interrupted:
+            self._closing = True
             self._announce("worker.stopping", {})
         except Drained as error:
             self._announce("worker.drained", {"reason": error.detail})
@@ -304,13 +306,15 @@ class Worker:
         self._announce("log", {"line": line} | (_names(current) if current else {}))
 
     def _interrupt(self, signum: int, frame: FrameType | None) -> None:
+        """Raise Interrupted, and again each second until it is heard: what is raised in a finalizer is lost."""
         if not self._closing:
-            self._closing = True
+            signal.setitimer(signal.ITIMER_REAL, INTERRUPT_AGAIN_S)
             raise Interrupted
 
     def close(self) -> None:
         """Kill the child and give its task back, so that it is queued again at once."""
         self._closing = True
+        signal.setitimer(signal.ITIMER_REAL, 0)
         if self._child is not None:
             self._child.kill()
         if self._current is not None:
