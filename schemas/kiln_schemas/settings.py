@@ -146,8 +146,21 @@ class FitSettings(Contract):
         return "steps" if self.solver is Solver.CNN else "start_steps"
 
 
+class PackagedScene(StrEnum):
+    """Which form of the scene a package holds."""
+
+    FLAT = "flat"
+    """scene.glb: flattened to world space, as it was baked."""
+    ORIGINAL = "original"
+    """The user's own glTF file with TEXCOORD_1 as well, in original.glb."""
+
+
 class PackageSettings(Contract):
     """What is written besides the textures."""
+
+    scene: PackagedScene = Field(
+        default=PackagedScene.FLAT, description="original: the user's own glTF file with TEXCOORD_1 as well"
+    )
 
     environment_size: int = Field(
         default=128,

@@ -23,6 +23,7 @@ from kiln_schemas.conventions import (
     IRRADIANCE_KTX2,
     LIGHT_FIELD_KTX2,
     MANIFEST_JSON,
+    ORIGINAL_GLB,
     REPORT_HTML,
     SCENE_GLB,
     VISIBILITY_KTX2,
@@ -103,6 +104,8 @@ class PackageInput:
     stage_seconds: Mapping[str, float]
     versions: Mapping[str, str]
     left_out: Mapping[str, str] = field(default_factory=dict)
+    original: bytes | None = None
+    """`original.glb`, where it is asked for."""
     supercompress: bool = False
     """Zstandard inside the lobe textures; engines that cannot inflate need plain files."""
 
@@ -168,6 +171,9 @@ def build_package(folder: Path, given: PackageInput, judge: Judge | None = None)
         _write_environment(package, given.environment)
     write_bytes(folder / SCENE_GLB, encode_glb(given.scene))
     package.add(SCENE_GLB)
+    if given.original is not None:
+        write_bytes(folder / ORIGINAL_GLB, given.original)
+        package.add(ORIGINAL_GLB)
     for name, text in shaders.sources().items():
         write_bytes(folder / "shaders" / name, text.encode("utf-8"))
         package.add(f"shaders/{name}")

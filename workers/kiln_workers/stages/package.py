@@ -12,22 +12,25 @@ import numpy.typing as npt
 
 from kiln_schemas import __version__
 from kiln_schemas.errors import InternalError
-from kiln_schemas.settings import Function, PackageSettings
+from kiln_schemas.job import check_bundle
+from kiln_schemas.settings import Function, PackagedScene, PackageSettings
 from kiln_schemas.tasks import FitMetrics, FitResult, PackagePayload, PackageResult, RefineResult, Tile
 from kiln_workers.fit.metrics import TexelErrors, texel_errors
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.source import valid_texels
 from kiln_workers.package.build import EnvironmentTextures, LobeMap, PackageInput, build_package
 from kiln_workers.package.half import as_stored
+from kiln_workers.package.original import encode_original
 from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelPreview, choose_texels
 from kiln_workers.render.environment import environment_u, ggx_prefilter, panorama
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import unpack_scene
-from kiln_workers.scene.model import Environment
+from kiln_workers.scene.model import Environment, Scene
 from kiln_workers.scene.picture import texel_map_picture
 from kiln_workers.scene.texel_map import TexelMap, unpack_texel_map
 from kiln_workers.sphere.gaussian import evaluate
 from kiln_workers.sphere.octahedral import pixel_directions
+from kiln_workers.stages.bundle import lay_out
 from kiln_workers.stages.gates import GateJudge
 from kiln_workers.stages.refine import read_lobes
 from kiln_workers.stages.tiles import map_coordinates, with_render_verdict
@@ -95,6 +98,7 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
             environment=environment,
             stage_seconds=_stage_seconds(payload, time.perf_counter() - began),
             versions=_versions(),
+            original=_original(payload, scene, context),
             supercompress=payload.settings.package.supercompress,
         ),
         judge,
@@ -102,6 +106,14 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
     for artifact in artifacts:
         context.put_blob(folder / artifact.name)
     return PackageResult(artifacts=tuple(artifacts), gates=judge.results, seconds=time.perf_counter() - began)
+
+
+def _original(payload: PackagePayload, scene: Scene, context: Context) -> bytes | None:
+    """The user's own file with the light-map UVs, where it is asked for."""
+    if payload.settings.package.scene is not PackagedScene.ORIGINAL:
+        return None
+    bundle = check_bundle(payload.bundle)
+    return encode_original(lay_out(bundle, context), bundle.entry, scene.meshes)
 
 
 @dataclass(frozen=True)

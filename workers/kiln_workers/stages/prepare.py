@@ -3,13 +3,13 @@
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Final
 
 from kiln_schemas.errors import InputError, TooLarge
 from kiln_schemas.job import check_bundle
-from kiln_schemas.settings import BakeSettings, Function, Solver
-from kiln_schemas.tasks import MOST_NOTES, MOST_PLACEMENTS, MOST_TILES, Bundle, PreparePayload, PrepareResult
+from kiln_schemas.settings import BakeSettings, Function, PackagedScene, Solver
+from kiln_schemas.tasks import MOST_NOTES, MOST_PLACEMENTS, MOST_TILES, PreparePayload, PrepareResult
+from kiln_workers.package.original import check_original
 from kiln_workers.render.between import between_maps
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import pack_scene, scene_hash
@@ -21,6 +21,7 @@ from kiln_workers.scene.model import Scene
 from kiln_workers.scene.sheets import part_sheets
 from kiln_workers.scene.texel_map import COARSE, SPECK, TexelMap, pack_texel_map, speck_share
 from kiln_workers.scene.texels import build_texel_map
+from kiln_workers.stages.bundle import lay_out
 from kiln_workers.stages.tiles import plan_tiles
 from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
 from kiln_workers.store.light_field import LightFieldStore
@@ -44,13 +45,16 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         context.progress(index, len(STEPS), "steps", STEPS[index])
 
     step(0)
-    folder = _lay_out(bundle, context)
+    folder = lay_out(bundle, context)
     step(1)
     scene = part_sheets(check_light(load_scene(folder, bundle.entry, bundle.environment)))
     scene = replace(scene, notes=(*scene.notes, *lamp_notes(scene)))
+    original = settings.package.scene is PackagedScene.ORIGINAL
+    if original:
+        check_original(folder, bundle.entry)
     step(2)
     with deadline(LAYOUT_S, bundle.entry, "give a light map", "Simplify it, or give it a light-map UV (TEXCOORD_1)."):
-        lightmap = make_lightmap(scene, settings.lightmap)
+        lightmap = make_lightmap(scene, settings.lightmap, may_cut=not original)
         scene = lightmap.scene
         step(3)
         texel_map = build_texel_map(scene, lightmap.resolution)
@@ -110,16 +114,6 @@ def _coarse_note(texel_map: TexelMap) -> list[str]:
         f"Light map: too coarse for this scene. {100 * share:.0f} % of its texels lie in charts of {SPECK} texels or"
         " fewer, where light cannot change. Raise lightmap.resolution or lightmap.most."
     ]
-
-
-def _lay_out(bundle: Bundle, context: Context) -> Path:
-    """The bundle as files in a folder; every path was checked to stay inside."""
-    folder = context.scratch / "bundle"
-    for path, sha256 in sorted(bundle.files.items()):
-        target = folder / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(context.blob(sha256))
-    return folder
 
 
 def _create_store(url: str, scene: Scene, texel_map: TexelMap, digest: str, settings: BakeSettings) -> None:
