@@ -1,10 +1,12 @@
 """Fit the glossy kernels of `shade.algorithm.reflection_kernels` to GGX and print their coefficients.
 
-    python benchmarks/kernel.py [--gaussians 1|2]
+    python benchmarks/kernel.py [--gaussians 1|2] [--f0 1|0.04] [--coarse]
 
-Minimises the mean squared Hellinger distance between the normalised D G (n.i) of GGX (Smith's correlated G) and one or
-two normalised anisotropic Gaussians, over a grid of alpha and o.n: first with parameters of their own at each place of
-the grid, then with parameters that are cubic in both, which start from the first by least squares. Takes two minutes.
+Minimises the mean squared Hellinger distance between the normalised D G F (n.i) of GGX (Smith's correlated G, Schlick's
+F, which is 1 for F0 = 1) and one or two normalised anisotropic Gaussians, over a grid of alpha and o.n: first with
+parameters of their own at each place of the grid, then with parameters that are cubic in both, which start from the
+first by least squares. Takes some minutes; a quarter of them on the coarse grid, which the kernel of dielectrics is
+from.
 """
 
 import argparse
@@ -21,20 +23,21 @@ from kiln_workers.sphere import ggx
 ALPHAS = (0.04, 0.06, 0.09, 0.12, 0.16, 0.2, 0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.75, 1.0)
 COSINES = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97, 1.0)
 DIRECTIONS = 2048
+COARSE = ((0.04, 0.08, 0.14, 0.22, 0.36, 0.6, 1.0), (0.05, 0.1, 0.18, 0.3, 0.45, 0.65, 0.85, 1.0), 448)
 STEPS = 1000
 RATE = 0.05
 RIDGE = 1e-4
 START = {1: (3.0, 0.5, 0.5), 2: (3.0, 0.5, 0.5, 1.0, -1.5, -1.5, -0.5)}
 
 
-def microfacet(alpha: float, cosine: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def microfacet(alpha: float, cosine: float, f0: float, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Directions [K, 3] in the normal's frame, roots of the normalised lobe [K], solid angles that they stand for.
 
     Half of the directions are reflected by half vectors from D (n.h), half are uniform.
     """
     specular = np.array([math.sqrt(1.0 - cosine**2), 0.0, cosine])
     view = specular * (-1.0, 1.0, 1.0)
-    random, half = qmc.Sobol(2, seed=1).random(DIRECTIONS), DIRECTIONS // 2
+    random, half = qmc.Sobol(2, seed=1).random(count), count // 2
     elevation = np.sqrt((1.0 - random[:half, 0]) / (1.0 + (alpha**2 - 1.0) * random[:half, 0]))
     normals = _polar(elevation, random[:half, 1])
     reflected = 2.0 * (normals @ view)[:, None] * normals - view
@@ -44,10 +47,11 @@ def microfacet(alpha: float, cosine: float) -> tuple[np.ndarray, np.ndarray, np.
     halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
     distribution = ggx.distribution(halfway[:, 2], alpha)
     density = 0.25 / math.pi + 0.5 * distribution * halfway[:, 2] / (4.0 * halfway @ view)
-    solid_angles = 1.0 / (density * DIRECTIONS)
-    lobe = distribution * ggx.masking_shadowing(directions[:, 2], cosine, alpha)
+    solid_angles = 1.0 / (density * count)
+    fresnel = f0 + (1.0 - f0) * (1.0 - np.clip(halfway @ view, 0.0, 1.0)) ** 5
+    lobe = fresnel * distribution * ggx.masking_shadowing(directions[:, 2], cosine, alpha)
     root = np.sqrt(lobe / (lobe * solid_angles).sum())
-    missing = DIRECTIONS - len(directions)  # below the horizon: filled up with directions that stand for nothing
+    missing = count - len(directions)  # below the horizon: filled up with directions that stand for nothing
     above = np.concatenate([directions, np.tile([0.0, 0.0, 1.0], (missing, 1))])
     return above, np.pad(root, (0, missing)), np.pad(solid_angles, (0, missing))
 
@@ -61,9 +65,10 @@ def _polar(cosines: np.ndarray, turns: np.ndarray) -> np.ndarray:
 class Grid:
     """All places of the grid [G] with their microfacet lobes [G, K]."""
 
-    def __init__(self) -> None:
-        places = [(alpha, cosine) for alpha in ALPHAS for cosine in COSINES]
-        lobes = zip(*(microfacet(*place) for place in places), strict=True)
+    def __init__(self, f0: float, coarse: bool) -> None:
+        alphas, cosines, count = COARSE if coarse else (ALPHAS, COSINES, DIRECTIONS)
+        places = [(alpha, cosine) for alpha in alphas for cosine in cosines]
+        lobes = zip(*(microfacet(*place, f0, count) for place in places), strict=True)
         self.directions, self.root, self.solid_angles = (torch.from_numpy(np.stack(part)).float() for part in lobes)
         self.alpha, self.cosine = torch.tensor(places).unbind(-1)
 
@@ -111,12 +116,19 @@ def main() -> None:
     """Fit and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--gaussians", type=int, choices=sorted(START), default=2)
-    start = torch.tensor(START[parser.parse_args().gaussians])
-    grid = Grid()
+    parser.add_argument("--f0", type=float, default=1.0)
+    parser.add_argument("--coarse", action="store_true")
+    options = parser.parse_args()
+    start = torch.tensor(START[options.gaussians])
+    grid = Grid(options.f0, options.coarse)
     free = descend(grid, start.repeat(len(grid.alpha), 1), None, "at each place")
     terms = kernel_terms(grid.cosine, grid.alpha)
     first = torch.linalg.lstsq(terms, free.clamp(-6.0, 6.0)).solution
-    for row in descend(grid, first, terms, "polynomials").tolist():
+    # Descend in orthonormal terms: the powers are nearly dependent.
+    orthonormal, upper = torch.linalg.qr(terms)
+    size = math.sqrt(len(terms))
+    found = descend(grid, upper @ first / size, orthonormal * size, "polynomials")
+    for row in torch.linalg.solve(upper, found * size).tolist():
         print("(" + ", ".join(f"{value:.5g}" for value in row) + "),")
 
 

@@ -36,6 +36,7 @@ _PROBES: Final = {
     "lkSaturated": ["vec4(lkSaturated(m), 0.0, 0.0, 0.0)"],
     "lkCap": ["vec4(lkCap(sharpness), 0.0, 0.0, 0.0)"],
     "lkReflectionLobe": _lobe("made"),
+    "lkAlbedoTerms": ["vec4(lkAlbedoTerms(clamp(dot(n, o), 1e-4, 1.0), alpha), 0.0, 0.0)"],
     "lkReflection": [*_lobe("reflection.peak"), *_lobe("reflection.tail"), "vec4(reflection.tailShare, 0.0, 0.0, 0.0)"],
     "lkConvolve": ["vec4(lkConvolve(a, wide), 0.0)"],
     "lkMeanUnder": ["vec4(lkMeanUnder(a, reflection), 0.0)"],
@@ -50,6 +51,7 @@ _PROBES: Final = {
     "lkLobeSum": ["vec4(lkLobeSum(tLightField, lobes, uv, v), 0.0)"],
     "lkF0": ["vec4(lkF0(surface), 0.0)"],
     "lkReflectance": ["vec4(lkReflectance(surface, o), 0.0)"],
+    "lkSurfaceReflection": ["vec4(lkSurfaceReflection(surface, o).peak.z, 0.0)"],
     "lkInterreflection": ["vec4(lkInterreflection(tLightField, lobes, uv, surface, o), 0.0)"],
     "lkGlossyDirection": ["vec4(lkGlossyDirection(surface, o), 0.0)"],
     "lkEnvironmentUnoccluded": ["vec4(lkEnvironmentUnoccluded(surface, o, light), 0.0)"],
@@ -83,7 +85,7 @@ LkAnisotropicLobe wide = LkAnisotropicLobe(x, y, z, sharpness, given(index, 6).w
 LkSurface surface = LkSurface(n, given(index, 11).xyz, given(index, 11).w, roughness);
 vec3 light = given(index, 12).xyz;
 LkAnisotropicLobe made = lkReflectionLobe(n, x, y, z, alpha, 1.0);
-LkReflection reflection = lkReflection(n, o, alpha);
+LkReflection reflection = lkReflection(n, o, alpha, max(lkF0(surface).x, max(lkF0(surface).y, lkF0(surface).z)));
 LkLobe fetched = lkFetchLobe(tLightField, uv, k);
 """
 

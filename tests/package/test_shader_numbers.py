@@ -19,7 +19,9 @@ from kiln_workers.shade import algorithm
     [
         ("sg.glsl", "lkReflection", "peak", "vec3", [row[:3] for row in algorithm.KERNEL_FIT]),
         ("sg.glsl", "lkReflection", "tail", "vec4", [row[3:] for row in algorithm.KERNEL_FIT]),
-        ("lightkiln.glsl", "lkReflectance", "fit", "vec4", algorithm.ALBEDO_FIT),
+        ("sg.glsl", "lkReflection", "dullPeak", "vec3", [row[:3] for row in algorithm.DIELECTRIC_KERNEL_FIT]),
+        ("sg.glsl", "lkReflection", "dullTail", "vec4", [row[3:] for row in algorithm.DIELECTRIC_KERNEL_FIT]),
+        ("sg.glsl", "lkAlbedoTerms", "fit", "vec4", algorithm.ALBEDO_FIT),
     ],
 )
 def test_polynomials_agree(
@@ -31,7 +33,7 @@ def test_polynomials_agree(
     assert len(rows) == len(fitted)
     np.testing.assert_array_equal([[float(x) for x in numbers.split(",")] for numbers, _ in rows], np.array(fitted))
     terms = ["1"] + [term.replace(" * ", "") for _, term in rows[1:]]
-    if function == "lkReflectance":
+    if function == "lkAlbedoTerms":
         assert terms == ["1", "x", "y", "xy", "xx", "yy", "xxy", "xyy", "xxyy"]
     else:
         assert terms == ["1", "y", "x", "yy", "yx", "xx", "yyy", "yyx", "yxx", "xxx"]

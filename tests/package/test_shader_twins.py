@@ -28,7 +28,7 @@ WAYS = {"WebGL2": "glsl", "Tint": "wgsl", "naga": "wgsl", "DXC": "hlsl"}
 BETWEEN_LANGUAGES = 1e-6
 """Largest difference from GLSL over the largest component of GLSL's result; 0 where all share a driver, as here."""
 
-FROM_EVALUATOR = 4e-5
+FROM_EVALUATOR = 8e-5
 """Likewise of GLSL from the evaluator: what 32 bits lose. Sharp lobes lose more (`shader_reference.rounding`)."""
 
 Run = Callable[[str, Mapping[str, str]], np.ndarray]
@@ -162,7 +162,7 @@ def test_glsl_agrees_with_the_evaluator(glsl: np.ndarray, given, images) -> None
         ("sg", "1.0 - 0.5 * s", "1.0 - 0.51 * s"),
         ("environment", "(2.0 - roughness)", "(2.001 - roughness)"),
         ("environment", "p.yx", "p.xy"),
-        ("lightkiln", "28.513", "28.514"),
+        ("sg", "28.513", "28.514"),
         ("lightkiln", "2 * index + 1", "2 * index"),
     ],
 )

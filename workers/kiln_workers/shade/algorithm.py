@@ -54,7 +54,21 @@ KERNEL_FIT = (
     (-10.127, -0.65908, 1.8442, 8.5499, 8.1529, 8.179, 0.41033),
 )
 """Of peak and tail the tilt and the logarithms of both sharpnesses, and the logit of the tail's share, by 1, y, x, yy,
-yx, xx, yyy, yyx, yxx, xxx with x = o.n and y = alpha; made by benchmarks/kernel.py."""
+yx, xx, yyy, yyx, yxx, xxx with x = o.n and y = alpha, for F = 1; made by benchmarks/kernel.py."""
+
+DIELECTRIC_KERNEL_FIT = (
+    (3.5087, 6.1466, 0.31717, 1.3469, 2.2693, -1.3649, -0.99691),
+    (-14.927, -10.617, 6.4329, -5.5116, -6.286, 15.816, -0.72569),
+    (9.2442, -14.179, -1.8546, 13.53, -7.131, -4.976, -0.93423),
+    (29.136, 9.8029, -9.0838, 6.6684, -9.3215, -46.173, 1.9492),
+    (-31.547, 29.464, 0.10216, -60.773, 21.151, 0.14139, 0.80545),
+    (29.477, 10.305, -0.10713, -8.4247, -0.30667, 3.119, 0.68347),
+    (-15.734, -3.2611, 5.5563, -8.5622, 9.0538, 27.477, -0.67734),
+    (15.375, -14.138, 3.72, 33.409, -6.9217, 9.3747, 3.9864),
+    (16.159, -16.38, -5.3183, 29.369, -9.6045, -7.3724, -1.3311),
+    (-38.25, -2.3315, 1.7695, -1.2706, 2.8032, 0.73681, 0.4454),
+)
+"""The same for F0 = 0.04 (`--f0 0.04`): towards grazing angles F turns the lobe away from the normal."""
 
 
 @dataclass(frozen=True)
@@ -105,19 +119,34 @@ class Kernel:
 
 
 def reflection_kernels(surface: Surface) -> tuple[Kernel, Kernel]:
-    """K: D G (n.i) seen from o as two anisotropic Gaussians, its peak and its tail, whose integrals add up to 1.
+    """K: D G F (n.i) seen from o as two anisotropic Gaussians, its peak and its tail, whose integrals add up to 1.
 
     Their axes leave the specular direction for the normal as the surface gets rougher and the view lower, and they are
     wider than eq. 18 has it there. Tilts, sharpnesses and shares are polynomials in o.n and alpha, fitted to the
     normalised microfacet lobe by the Hellinger distance, whose mean square is 0.03 (one Gaussian 0.11, eq. 18 0.27).
+    There is a fit for F = 1 and one for F0 = 0.04; Schlick's F of any F0 is a sum of both, and the parameters are mixed
+    by what each part reflects.
     """
     x, y = surface.cosine, surface.alpha.clamp(ALBEDO_LEAST_ALPHA, 1.0)
-    fit = kernel_terms(x, y) @ x.new_tensor(KERNEL_FIT)
+    terms = kernel_terms(x, y)
+    ends = terms @ x.new_tensor(KERNEL_FIT), terms @ x.new_tensor(DIELECTRIC_KERNEL_FIT)
+    fit = torch.lerp(*ends, dielectric_share(surface)[:, None])
     across, tail = _across(surface), torch.sigmoid(fit[:, 6])
     return (
         _gaussian(surface, across, fit[:, :3], y, 1.0 - tail),
         _gaussian(surface, across, fit[:, 3:6], y, tail),
     )
+
+
+def dielectric_share(surface: Surface) -> Tensor:
+    """What a surface's largest F0 reflects as a dielectric of 0.04 would [P]: (1 - F0) / 0.96 of it, over the whole.
+
+    F0 + (1 - F0) u = p + q (0.04 + 0.96 u) with q = (1 - F0) / 0.96, u = (1 - o.h)^5.
+    """
+    f0 = specular_f0(surface).amax(dim=-1)
+    a, b = albedo_terms(surface)
+    share = (1.0 - f0) / (1.0 - DIELECTRIC_F0) * (DIELECTRIC_F0 * a + b) / (f0 * a + b).clamp(min=1e-6)
+    return share.clamp(0.0, 1.0)
 
 
 def kernel_terms(cosine: Tensor, alpha: Tensor) -> Tensor:
@@ -236,12 +265,18 @@ def reflectance(surface: Surface) -> Tensor:
     alpha, in the form that MaterialX 1.38 (`mx_ggx_dir_albedo_analytic`) uses; the coefficients are our own fit for
     alpha 0.04 to 1 and o.n from 0.02 (2 % at most against quadrature, rms 1 %).
     """
+    a, b = albedo_terms(surface)
+    return specular_f0(surface) * a[:, None] + b[:, None]
+
+
+def albedo_terms(surface: Surface) -> tuple[Tensor, Tensor]:
+    """A and B [P] of `reflectance`."""
     x, y = surface.cosine, surface.alpha.clamp(min=ALBEDO_LEAST_ALPHA)
     xx, yy = x * x, y * y
     terms = torch.stack([torch.ones_like(x), x, y, x * y, xx, yy, xx * y, x * yy, xx * yy], dim=-1)
     fit = terms @ terms.new_tensor(ALBEDO_FIT)
     a, b = (fit[:, :2] / fit[:, 2:]).clamp(0.0, 1.0).unbind(-1)
-    return specular_f0(surface) * a[:, None] + b[:, None]
+    return a, b
 
 
 def mean_scale(surface: Surface) -> Tensor:

@@ -43,29 +43,24 @@ float3 lkF0(LkSurface surface) {
   return lerp(0.04, surface.baseColor, surface.metallic);
 }
 
-// The single-scattering albedo of GGX: the integral over i of D G F / (4 n.o), F0 A + B with A and B rational in o.n
-// and alpha (the form of MaterialX' mx_ggx_dir_albedo_analytic, coefficients our own; within 2 % for alpha 0.04 to 1).
-// The paper takes F and G at the specular direction instead (step 5 of section 6), which loses up to half of the light.
+// The single-scattering albedo. The paper takes F and G at the specular direction instead (step 5 of section 6), which
+// loses up to half of the light.
 float3 lkReflectance(LkSurface surface, float3 o) {
   float x = clamp(dot(surface.normal, o), 1e-4, 1.0);
-  float y = max(surface.roughness * surface.roughness, 0.04);
-  float4 fit = float4(0.079654, 0.82584, 1.0, 1.0);
-  fit += float4(-2.112, -1.9157, -2.3351, -2.4264) * (x);
-  fit += float4(10.725, 0.021977, 9.5778, 10.771) * (y);
-  fit += float4(-5.696, 0.58532, 0.54603, -6.4866) * (x * y);
-  fit += float4(40.966, 1.088, 39.229, 18.855) * (x * x);
-  fit += float4(-8.8396, 0.14768, -8.5177, 11.302) * (y * y);
-  fit += float4(-40.58, -0.52883, -36.547, -51.571) * (x * x * y);
-  fit += float4(24.516, -0.68548, 28.513, 105.32) * (x * y * y);
-  fit += float4(-2.1546, 0.42731, 23.074, 52.019) * (x * x * y * y);
-  float2 ab = saturate(fit.xy / fit.zw);
+  float2 ab = lkAlbedoTerms(x, surface.roughness * surface.roughness);
   return lkF0(surface) * ab.x + ab.y;
 }
 
-// Glossy reflection of the scene: the mean of each lobe of the light field under D G (n.i) (steps 3 to 6 of section 6).
+// What a surface gathers light with.
+LkReflection lkSurfaceReflection(LkSurface surface, float3 o) {
+  float3 f0 = lkF0(surface);
+  return lkReflection(surface.normal, o, surface.roughness * surface.roughness, max(f0.x, max(f0.y, f0.z)));
+}
+
+// Glossy reflection of the scene: the mean of each lobe of the light field under D G F (n.i) (steps 3 to 6 of section 6).
 float3 lkInterreflection(Texture2DArray lightField, SamplerState lightFieldSampler, int count, float2 uv,
                          LkSurface surface, float3 o) {
-  LkReflection reflection = lkReflection(surface.normal, o, surface.roughness * surface.roughness);
+  LkReflection reflection = lkSurfaceReflection(surface, o);
   float3 sum = 0.0;
   for (int k = 0; k < count; k++) sum += lkMeanUnder(lkFetchLobe(lightField, lightFieldSampler, uv, k), reflection);
   return sum * lkReflectance(surface, o);
@@ -74,7 +69,7 @@ float3 lkInterreflection(Texture2DArray lightField, SamplerState lightFieldSampl
 // Where a glossy surface gathers most of its light from: the specular direction of a mirror, nearer to the normal for a
 // rough surface seen from the side (Lagarde and de Rousiers 2014 call it the dominant direction).
 float3 lkGlossyDirection(LkSurface surface, float3 o) {
-  LkReflection reflection = lkReflection(surface.normal, o, surface.roughness * surface.roughness);
+  LkReflection reflection = lkSurfaceReflection(surface, o);
   return normalize(lerp(reflection.peak.z, reflection.tail.z, reflection.tailShare));
 }
 

@@ -59,7 +59,7 @@ float lkCap(vec2 s) {
   return LK_PI * sqrt(lkSaturated(s.x) * lkSaturated(s.y));
 }
 
-// What a GGX surface of width alpha gathers light with, D G (n.i) normalised: two lobes whose integrals add up to 1.
+// What a GGX surface of width alpha gathers light with, D G F (n.i) normalised: two lobes whose integrals add up to 1.
 struct LkReflection {
   LkAnisotropicLobe peak;
   LkAnisotropicLobe tail;
@@ -77,10 +77,26 @@ LkAnisotropicLobe lkReflectionLobe(vec3 n, vec3 specular, vec3 across, vec3 fit,
   return lobe;
 }
 
+// The single-scattering albedo of GGX is F0 A + B, the integral over i of D G F / (4 n.o): A and B, rational in o.n and
+// alpha (the form of MaterialX' mx_ggx_dir_albedo_analytic, coefficients our own; within 2 % for alpha 0.04 to 1).
+vec2 lkAlbedoTerms(float x, float alpha) {
+  float y = max(alpha, 0.04);
+  vec4 fit = vec4(0.079654, 0.82584, 1.0, 1.0);
+  fit += vec4(-2.112, -1.9157, -2.3351, -2.4264) * (x);
+  fit += vec4(10.725, 0.021977, 9.5778, 10.771) * (y);
+  fit += vec4(-5.696, 0.58532, 0.54603, -6.4866) * (x * y);
+  fit += vec4(40.966, 1.088, 39.229, 18.855) * (x * x);
+  fit += vec4(-8.8396, 0.14768, -8.5177, 11.302) * (y * y);
+  fit += vec4(-40.58, -0.52883, -36.547, -51.571) * (x * x * y);
+  fit += vec4(24.516, -0.68548, 28.513, 105.32) * (x * y * y);
+  fit += vec4(-2.1546, 0.42731, 23.074, 52.019) * (x * x * y * y);
+  return clamp(fit.xy / fit.zw, 0.0, 1.0);
+}
+
 // The reflection of a GGX surface seen from the unit direction o. Its lobes' axes leave the specular direction for the
 // normal as alpha grows and the view lowers; tilts, sharpnesses and shares are polynomials in o.n and alpha, fitted to the
 // microfacet model. The paper's eq. 17 and 18 (Wang et al. 2009) hold for smooth surfaces seen from above only.
-LkReflection lkReflection(vec3 n, vec3 o, float alpha) {
+LkReflection lkReflection(vec3 n, vec3 o, float alpha, float f0) {
   float x = clamp(dot(n, o), 1e-4, 1.0);
   float y = clamp(alpha, 0.04, 1.0);
   vec3 peak = vec3(3.6777, 5.49, -0.021158);
@@ -103,6 +119,32 @@ LkReflection lkReflection(vec3 n, vec3 o, float alpha) {
   tail += vec4(14.61, -21.17, 2.3152, 7.7452) * (y * y * x);
   tail += vec4(4.2414, -7.5434, -15.977, -1.8843) * (y * x * x);
   tail += vec4(8.5499, 8.1529, 8.179, 0.41033) * (x * x * x);
+  vec3 dullPeak = vec3(3.5087, 6.1466, 0.31717);
+  dullPeak += vec3(-14.927, -10.617, 6.4329) * (y);
+  dullPeak += vec3(9.2442, -14.179, -1.8546) * (x);
+  dullPeak += vec3(29.136, 9.8029, -9.0838) * (y * y);
+  dullPeak += vec3(-31.547, 29.464, 0.10216) * (y * x);
+  dullPeak += vec3(29.477, 10.305, -0.10713) * (x * x);
+  dullPeak += vec3(-15.734, -3.2611, 5.5563) * (y * y * y);
+  dullPeak += vec3(15.375, -14.138, 3.72) * (y * y * x);
+  dullPeak += vec3(16.159, -16.38, -5.3183) * (y * x * x);
+  dullPeak += vec3(-38.25, -2.3315, 1.7695) * (x * x * x);
+  vec4 dullTail = vec4(1.3469, 2.2693, -1.3649, -0.99691);
+  dullTail += vec4(-5.5116, -6.286, 15.816, -0.72569) * (y);
+  dullTail += vec4(13.53, -7.131, -4.976, -0.93423) * (x);
+  dullTail += vec4(6.6684, -9.3215, -46.173, 1.9492) * (y * y);
+  dullTail += vec4(-60.773, 21.151, 0.14139, 0.80545) * (y * x);
+  dullTail += vec4(-8.4247, -0.30667, 3.119, 0.68347) * (x * x);
+  dullTail += vec4(-8.5622, 9.0538, 27.477, -0.67734) * (y * y * y);
+  dullTail += vec4(33.409, -6.9217, 9.3747, 3.9864) * (y * y * x);
+  dullTail += vec4(29.369, -9.6045, -7.3724, -1.3311) * (y * x * x);
+  dullTail += vec4(-1.2706, 2.8032, 0.73681, 0.4454) * (x * x * x);
+  // Schlick's F of any F0 is a sum of 1 and of that of 0.04: the parameters are mixed by what each part reflects.
+  vec2 ab = lkAlbedoTerms(x, y);
+  float part = (1.0 - f0) / 0.96 * (0.04 * ab.x + ab.y) / max(f0 * ab.x + ab.y, 1e-6);
+  float share = clamp(part, 0.0, 1.0);
+  peak = mix(peak, dullPeak, share);
+  tail = mix(tail, dullTail, share);
   vec3 specular = 2.0 * dot(n, o) * n - o;
   // Perpendicular to the plane of incidence; looking along the normal any frame about z will do.
   vec3 across = cross(n, specular);
