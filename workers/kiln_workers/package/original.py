@@ -21,8 +21,7 @@ import numpy.typing as npt
 from kiln_schemas.errors import InputError
 from kiln_schemas.text import told
 from kiln_workers.scene.bundle import BundleFolder
-from kiln_workers.scene.geometry import Floats, Ints
-from kiln_workers.scene.geometry import _sound_faces as sound_faces
+from kiln_workers.scene.geometry import Floats, Ints, sound_faces
 from kiln_workers.scene.gltf import FAN, STRIP, TRIANGLES, _local_matrix, _triangulated
 from kiln_workers.scene.gltf_buffers import CHUNK_BIN, CHUNK_JSON, COMPONENTS, GltfBuffers, split_glb
 from kiln_workers.scene.gltf_document import Document, Primitive, parse_document
@@ -198,7 +197,7 @@ def _corner_uv(positions: Floats, faces: Ints, matrix: Floats, mesh: Mesh) -> Fl
     """
     assert mesh.lightmap_uv is not None
     linear = matrix[:3, :3]
-    placed = (positions @ linear.T + matrix[:3, 3]).astype(np.float32).astype(np.float64)
+    placed = positions @ linear.T + matrix[:3, 3]
     mirrored = bool(np.linalg.det(linear) < 0.0)
     baked = sound_faces(placed, faces) if len(mesh.faces) < len(faces) else np.ones(len(faces), dtype=bool)
     if int(baked.sum()) != len(mesh.faces):
