@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich_scene import rich_scene
 
 from kiln_schemas.errors import InternalError
 from kiln_workers.package.colour import quantise, srgb_encode
@@ -40,6 +41,15 @@ def test_the_khronos_validator_finds_nothing(make_scene, node_tools, tmp_path: P
     assert (report["issues"]["numErrors"], report["issues"]["numWarnings"]) == (0, 0), report["issues"]
     assert report["info"]["totalTriangleCount"] == 6
     assert report["info"]["maxUVs"] == 2
+
+
+def test_the_validator_finds_nothing_in_all_that_a_surface_has(node_tools, tmp_path: Path) -> None:
+    path = tmp_path / "scene.glb"
+    path.write_bytes(encode_glb(rich_scene()))
+    issues = node_tools.script("gltf_report.mjs", path)["issues"]
+    worst = [message["code"] for message in issues["messages"] if message["severity"] < 2]
+    # Tangents are the viewer's to make, as glTF 2.0 (3.7.2.1) has it.
+    assert worst == ["MESH_PRIMITIVE_GENERATED_TANGENT_SPACE"], issues
 
 
 def test_a_scene_without_textures_and_lights_is_valid_too(make_scene, node_tools, tmp_path: Path) -> None:

@@ -2,9 +2,10 @@
 
 Meshes are already flattened to world space (`scene.model`), so every node is an identity with one mesh, and the
 vertices of the GLB are those that were baked. Those of a scene far from the origin are about a point amid it; a node
-above all others moves them to where the user had them. Textures are embedded as PNG. Extensions used:
-KHR_materials_emissive_strength, KHR_texture_transform, KHR_lights_punctual; all optional to a reader. Written with
-pygltflib because trimesh loses TEXCOORD_1.
+above all others moves them to where the user had them. Textures are embedded as PNG. The first UV set of the textures
+is TEXCOORD_0, further ones are TEXCOORD_2 and so on; vertex colours are COLOR_0. Extensions used:
+KHR_texture_transform, KHR_lights_punctual, KHR_materials_emissive_strength, _transmission, _ior, _specular and
+_clearcoat; all optional to a reader. Written with pygltflib because trimesh loses TEXCOORD_1.
 """
 
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from kiln_workers.package.colour import quantise, srgb_decode, srgb_encode
 from kiln_workers.scene.model import Image, LightKind, Material, Mesh, PunctualLight, Scene, TextureRef
 
 _WRAP: Final = {"repeat": gltf.REPEAT, "clamp": gltf.CLAMP_TO_EDGE, "mirror": gltf.MIRRORED_REPEAT}
-_FLOAT_TYPES: Final = {2: gltf.VEC2, 3: gltf.VEC3}
+_FLOAT_TYPES: Final = {2: gltf.VEC2, 3: gltf.VEC3, 4: gltf.VEC4}
 
 
 @dataclass
@@ -45,7 +46,7 @@ class _Writer:
         return len(self.document.bufferViews) - 1
 
     def vertices(self, values: npt.NDArray[np.float32], *, bounds: bool = False) -> int:
-        """The accessor of a vertex attribute [V, 2 or 3]."""
+        """The accessor of a vertex attribute [V, 2 to 4]."""
         values = np.ascontiguousarray(values, dtype="<f4")
         accessor = gltf.Accessor(
             bufferView=self.view(values.tobytes(), gltf.ARRAY_BUFFER),
@@ -82,7 +83,7 @@ class _Writer:
         return self.images[key]
 
     def texture(self, ref: TextureRef, colour: bool) -> tuple[gltf.TextureInfo, float]:
-        """A texture lookup in TEXCOORD_0, and the factor that the image was divided by."""
+        """A texture lookup, and the factor that the image was divided by."""
         image, scale = self.image(ref.image, colour)
         if ref.wrap not in self.samplers:
             self.document.samplers.append(
@@ -98,7 +99,7 @@ class _Writer:
         if key not in self.textures:
             self.document.textures.append(gltf.Texture(source=image, sampler=key[1]))
             self.textures[key] = len(self.document.textures) - 1
-        info = gltf.TextureInfo(index=self.textures[key], texCoord=0)
+        info = gltf.TextureInfo(index=self.textures[key], texCoord=_tex_coord(ref.uv_set))
         transform: dict[str, Any] = {}
         if ref.offset != (0.0, 0.0):
             transform["offset"] = [float(x) for x in ref.offset]
@@ -172,7 +173,7 @@ def _material(writer: _Writer, material: Material) -> gltf.Material:
     if material.metallic_roughness_texture is not None:
         pbr.metallicRoughnessTexture, _ = writer.texture(material.metallic_roughness_texture, colour=False)
     out = gltf.Material(name=material.name, pbrMetallicRoughness=pbr, doubleSided=material.double_sided)
-    out.alphaMode = gltf.OPAQUE if material.alpha_cutoff is None else gltf.MASK
+    out.alphaMode = gltf.BLEND if material.blend else gltf.OPAQUE if material.alpha_cutoff is None else gltf.MASK
     out.alphaCutoff = None if material.alpha_cutoff is None else max(0.0, float(material.alpha_cutoff))
     emission = np.asarray(material.emission, np.float64)
     if material.emission_texture is not None and emission.max() > 0.0:
@@ -180,10 +181,49 @@ def _material(writer: _Writer, material: Material) -> gltf.Material:
         emission = emission * scale
     strength = max(1.0, float(emission.max()))
     out.emissiveFactor = [_unit(x) for x in emission / strength]
+    if material.normal_texture is not None:
+        info, _ = writer.texture(material.normal_texture, colour=False)
+        out.normalTexture = gltf.NormalMaterialTexture(**vars(info), scale=float(material.normal_scale))
+    if material.occlusion_texture is not None:
+        info, _ = writer.texture(material.occlusion_texture, colour=False)
+        out.occlusionTexture = gltf.OcclusionTextureInfo(**vars(info), strength=_unit(material.occlusion_strength))
+    out.extensions = _layers(writer, material)
     if strength > 1.0:
-        out.extensions = {"KHR_materials_emissive_strength": {"emissiveStrength": strength}}
-        writer.extensions.add("KHR_materials_emissive_strength")
+        out.extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": strength}
+    writer.extensions |= set(out.extensions)
     return out
+
+
+def _layers(writer: _Writer, material: Material) -> dict[str, Any]:
+    """The extensions of a material whose values are not the core's."""
+    out: dict[str, Any] = {}
+    if material.transmission > 0.0:
+        out["KHR_materials_transmission"] = {"transmissionFactor": _unit(material.transmission)}
+        if material.transmission_texture is not None:
+            info, _ = writer.texture(material.transmission_texture, colour=False)
+            out["KHR_materials_transmission"]["transmissionTexture"] = _plain(info)
+    if material.ior != 1.5:
+        # The extension writes an infinite index of refraction as 0.
+        out["KHR_materials_ior"] = {"ior": 0.0 if material.ior >= 1e9 else float(material.ior)}
+    if material.specular != 1.0 or material.specular_color != (1.0, 1.0, 1.0):
+        out["KHR_materials_specular"] = {
+            "specularFactor": _unit(material.specular),
+            "specularColorFactor": [float(x) for x in material.specular_color],
+        }
+    if material.clearcoat > 0.0:
+        out["KHR_materials_clearcoat"] = {"clearcoatFactor": _unit(material.clearcoat)}
+    return out
+
+
+def _plain(info: gltf.TextureInfo) -> dict[str, Any]:
+    """A texture look-up inside an extension, which pygltflib takes as plain JSON."""
+    out: dict[str, Any] = {"index": info.index, "texCoord": info.texCoord}
+    return out | ({"extensions": info.extensions} if info.extensions else {})
+
+
+def _tex_coord(uv_set: int) -> int:
+    """The TEXCOORD of one of the mesh's UV sets; TEXCOORD_1 is the light map's."""
+    return 0 if uv_set == 0 else uv_set + 1
 
 
 def _mesh(writer: _Writer, mesh: Mesh) -> gltf.Mesh:
@@ -196,6 +236,10 @@ def _mesh(writer: _Writer, mesh: Mesh) -> gltf.Mesh:
         TEXCOORD_0=writer.vertices(uv),
         TEXCOORD_1=writer.vertices(mesh.lightmap_uv),
     )
+    for number, more in enumerate(mesh.more_uv, start=1):
+        setattr(attributes, f"TEXCOORD_{_tex_coord(number)}", writer.vertices(more))
+    if mesh.colors is not None:
+        attributes.COLOR_0 = writer.vertices(mesh.colors)
     indices = writer.indices(mesh.faces, len(mesh.positions))
     return gltf.Mesh(
         name=mesh.name,

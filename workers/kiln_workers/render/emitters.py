@@ -6,14 +6,18 @@ from the outer cone's to the inner one's. Its `range` is a hint that renderers m
 An area emitter whose radiance is textured over any UV layout, with holes where an alpha test removes the surface.
 
 Mitsuba's `area` samples textured radiance through the inverse of the UV map, which must then be injective; game
-textures repeat and overlap. This one samples the surface uniformly and looks the radiance up at the point.
+textures repeat and overlap. This one samples its triangles uniformly by area and looks the radiance up at the point.
+Mitsuba's own sampling of a mesh does not tell which triangle a point lies on, which mesh attributes need.
 """
 
 import math
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
+
 from kiln_workers.render.jit import dr, mi
+from kiln_workers.scene.model import Mesh
 
 
 def register_emitters() -> None:
@@ -24,39 +28,71 @@ def register_emitters() -> None:
 @lru_cache(maxsize=4)
 def _register(variant: str) -> None:
     class KilnArea(mi.Emitter):  # type: ignore[misc]
-        """One-sided area emitter: `radiance` and, optionally, `opacity` are textures."""
+        """One-sided area emitter: `radiance` and, optionally, `opacity` and `tint_alpha` are textures."""
 
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
             self.radiance = properties["radiance"]
-            self.opacity = properties.get("opacity")
+            covers = (properties.get(name) for name in ("opacity", "tint_alpha"))
+            self.covers = [cover for cover in covers if cover is not None]
             self.m_flags = int(mi.EmitterFlags.Surface) | int(mi.EmitterFlags.SpatiallyVarying)
+
+        def set_mesh(self, mesh: Mesh) -> None:
+            """The mesh that glows; before anything is sampled."""
+            corners = mesh.positions[mesh.faces]  # [F, 3, 3]
+            edges = corners[:, 1:].astype(np.float64) - corners[:, :1]
+            areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
+            self.areas = mi.DiscreteDistribution(mi.Float(areas.astype(np.float32)))
+            self.density = 1.0 / max(float(areas.sum()), 1e-30)
+            self.corners = mi.Float(np.ravel(corners).astype(np.float32))
+            uv = np.zeros((len(mesh.positions), 2), np.float32) if mesh.uv is None else mesh.uv
+            self.uv = mi.Float(np.ravel(uv[mesh.faces]).astype(np.float32))
+            dr.eval(self.corners, self.uv)
 
         def _radiance(self, si: Any, active: Any) -> Any:
             value = self.radiance.eval(si, active)
-            return value if self.opacity is None else value * self.opacity.eval(si, active)
+            for cover in self.covers:
+                value = value * cover.eval_1(si, active)
+            return value
 
         def eval(self, si: Any, active: Any = True) -> Any:
             return dr.select(mi.Frame3f.cos_theta(si.wi) > 0.0, self._radiance(si, active), 0.0)
 
         def sample_direction(self, it: Any, sample: Any, active: Any = True) -> Any:
-            ds = self.get_shape().sample_direction(it, sample, active)
-            active &= (dr.dot(ds.d, ds.n) < 0.0) & (ds.pdf > 0.0)
-            ds.emitter = mi.EmitterPtr(self)
-            radiance = self._at(ds, active)
-            return ds, dr.select(active, radiance / ds.pdf, 0.0)
+            triangle, left = self.areas.sample_reuse(sample.y, active)
+            b = mi.warp.square_to_uniform_triangle(mi.Point2f(sample.x, left))
+            first, second, third = (
+                dr.gather(mi.Point3f, self.corners, 3 * triangle + corner, active) for corner in range(3)
+            )
+            uv = [dr.gather(mi.Point2f, self.uv, 3 * triangle + corner, active) for corner in range(3)]
+            normal = dr.cross(second - first, third - first)
+
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.p = first + (second - first) * b.x + (third - first) * b.y
+            ds.n = mi.Normal3f(dr.normalize(normal))
+            ds.uv = uv[0] + (uv[1] - uv[0]) * b.x + (uv[2] - uv[0]) * b.y
+            ds.time, ds.delta, ds.emitter = it.time, False, mi.EmitterPtr(self)
+            ds.d = ds.p - it.p
+            square = dr.squared_norm(ds.d)
+            ds.dist = dr.sqrt(square)
+            ds.d /= ds.dist
+            facing = -dr.dot(ds.d, ds.n)
+            active = mi.Bool(active) & (facing > 0.0) & (dr.squared_norm(normal) > 0.0)
+            ds.pdf = dr.select(active, self.density * square / facing, 0.0)
+
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.p, si.n, si.uv, si.prim_index = ds.p, ds.n, ds.uv, triangle
+            si.shape = mi.ShapePtr(self.get_shape())
+            return ds, dr.select(active, self._radiance(si, active) / ds.pdf, 0.0)
 
         def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
             facing = dr.dot(ds.d, ds.n) < 0.0
             return dr.select(facing, self.get_shape().pdf_direction(it, ds, active), 0.0)
 
         def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
-            return dr.select(dr.dot(ds.d, ds.n) < 0.0, self._at(ds, active), 0.0)
-
-        def _at(self, ds: Any, active: Any) -> Any:
             si = dr.zeros(mi.SurfaceInteraction3f)
-            si.uv = ds.uv
-            return self._radiance(si, active)
+            si.p, si.n, si.uv = ds.p, ds.n, ds.uv
+            return dr.select(dr.dot(ds.d, ds.n) < 0.0, self._radiance(si, active), 0.0)
 
         def bbox(self) -> Any:
             return self.get_shape().bbox()

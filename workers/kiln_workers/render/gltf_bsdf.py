@@ -1,22 +1,35 @@
 """glTF's metallic-roughness surface as a Mitsuba BSDF: what the tracer, the references and the shaders mean alike.
 
-glTF 2.0, appendix B.2 and B.3: a metal reflects GGX with F0 = base colour, a dielectric GGX with F0 = 0.04 above
-Lambert times (1 - F); the two are mixed by metallic. F is Schlick's at the half vector, G Smith's with correlated
-heights (Heitz 2014, eq. 99), alpha = roughness^2. Light that meets the microsurface twice is lost, as in the
-specification. Towards grazing angles the sum of both lobes exceeds 1 for white dielectrics, as the specification allows
-(up to 1.36 at alpha 0.09; its mean over the hemisphere is at most 1.03). `sphere.ggx` has the terms in slow form.
-Mitsuba's `principled` is not this: its diffuse lobe is Disney's, brighter by a tenth on plaster.
+glTF 2.0, appendix B.2 and B.3: a metal reflects GGX with F0 = base colour, a dielectric GGX with its own F0 and F90
+(0.04 and 1, or as KHR_materials_ior, _specular and _clearcoat say) above Lambert times (1 - F); the two are mixed by
+metallic. F is Schlick's at the half vector, G Smith's with correlated heights (Heitz 2014, eq. 99), alpha =
+roughness^2. Light that meets the microsurface twice is lost, as in the specification. Towards grazing angles the sum of
+both lobes exceeds 1 for white dielectrics, as the specification allows (up to 1.36 at alpha 0.09; its mean over the
+hemisphere is at most 1.03). `sphere.ggx` has the terms in slow form. Mitsuba's `principled` is not this: its diffuse
+lobe is Disney's, brighter by a tenth on plaster.
+
+Light goes straight through as far as the surface is no surface (1 - opacity: an alpha test or a blended alpha), and
+where KHR_materials_transmission replaces Lambert: tinted by the base colour, less Fresnel's share, from either side.
+What passes is Mitsuba's `Null` component: `eval_null_transmission` has it, `sample` draws it unless its context leaves
+it out, and all other values are already times the opacity.
 Letters: i incident (`si.wi`, to the eye), o scattered (`wo`), h half-way; all in the frame of the shading normal.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
 
 from kiln_workers.render.jit import dr, mi
 
-DIELECTRIC_F0: Final = 0.04
 LEAST_CHANCE: Final = 0.1
 """Each of the two lobes that reflects at all is sampled at least this often: bounds the weight of a sample."""
+
+
+def reflections_only() -> Any:
+    """A context in which nothing passes straight through: the caller has already seen to it."""
+    context = mi.BSDFContext()
+    context.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Null)
+    return context
 
 
 def register_bsdfs() -> None:
@@ -24,50 +37,112 @@ def register_bsdfs() -> None:
     _register(mi.variant())
 
 
+@dataclass
+class _Point:
+    """The surface's parameters where a ray meets it."""
+
+    albedo: Any  # Color3f of Lambert's lobe
+    f0: Any  # Color3f
+    f90: Any  # Float
+    dielectric: tuple[Any, Any]  # F0 (the largest channel) and F90: Lambert's lobe gets the rest
+    alpha: Any  # Float: GGX
+    chance: Any  # Float: of the glossy lobe
+    opacity: Any  # Float: 1 where the surface is whole
+
+
 @lru_cache(maxsize=4)
 def _register(variant: str) -> None:
     class KilnGltf(mi.BSDF):  # type: ignore[misc]
-        """One-sided; `base_color`, `roughness` (perceptual, above 0) and `metallic` are textures."""
+        """One-sided unless `double_sided`.
+
+        `base_color`, `roughness` (perceptual, above 0), `metallic`, and where given `opacity` and `transmission` are
+        textures; `tint` (the vertices' colour) multiplies the base colour, `tint_alpha` the opacity.
+        """
 
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
-            self.base_color = properties["base_color"]
-            self.roughness = properties["roughness"]
-            self.metallic = properties["metallic"]
-            diffuse, glossy = (
-                mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide,
-                mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide,
-            )
-            self.m_components = [diffuse, glossy]
-            self.m_flags = diffuse | glossy
+            for name in ("base_color", "roughness", "metallic"):
+                setattr(self, name, properties[name])
+            for name in ("opacity", "tint", "tint_alpha", "transmission"):
+                setattr(self, name, properties.get(name))
+            self.f0 = mi.Color3f(*(float(properties.get(f"f0_{channel}", 0.04)) for channel in "rgb"))
+            self.f90 = float(properties.get("f90", 1.0))
+            self.double_sided = bool(properties.get("double_sided", False))
+            sides = mi.BSDFFlags.FrontSide
+            if self.double_sided:
+                sides = sides | mi.BSDFFlags.BackSide
+            self.m_components = [mi.BSDFFlags.DiffuseReflection | sides, mi.BSDFFlags.GlossyReflection | sides]
+            self.passes = self.opacity is not None or self.tint_alpha is not None or self.transmission is not None
+            if self.passes:
+                both = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+                self.m_components = [*self.m_components, mi.BSDFFlags.Null | both]
+            flags = self.m_components[0]
+            for component in self.m_components[1:]:
+                flags = flags | component
+            self.m_flags = flags
 
-        def _at(self, si: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-            """Lambert's albedo [Color3f], F0 [Color3f], alpha, and the chance of the glossy lobe."""
-            base, metallic = self.base_color.eval(si, active), self.metallic.eval_1(si, active)
+        def _at(self, si: Any, active: Any) -> _Point:
+            base, metallic = self._base(si, active), self.metallic.eval_1(si, active)
             alpha = dr.square(self.roughness.eval_1(si, active))
-            albedo, f0 = base * (1.0 - metallic), dr.lerp(mi.Color3f(DIELECTRIC_F0), base, metallic)
-            cos_i = mi.Frame3f.cos_theta(si.wi)
-            glossy, dull = dr.mean(_schlick(f0, cos_i)), dr.mean(albedo)
+            kept = 1.0 - metallic
+            if self.transmission is not None:
+                kept *= 1.0 - self.transmission.eval_1(si, active)
+            albedo, f0 = base * kept, dr.lerp(self.f0, base, metallic)
+            f90 = dr.lerp(mi.Float(self.f90), 1.0, metallic)
+            glossy = dr.mean(_schlick(f0, f90, dr.abs(mi.Frame3f.cos_theta(si.wi))))
+            dull = dr.mean(albedo)
             chance = dr.clip(glossy / dr.maximum(glossy + dull, 1e-8), LEAST_CHANCE, 1.0 - LEAST_CHANCE)
-            return albedo, f0, alpha, dr.select(dull > 0.0, chance, 1.0)
+            chance = dr.select(dull > 0.0, chance, 1.0)
+            return _Point(albedo, f0, f90, (dr.max(self.f0), self.f90), alpha, chance, self._opacity(si, active))
+
+        def _base(self, si: Any, active: Any) -> Any:
+            base = self.base_color.eval(si, active)
+            return base if self.tint is None else base * self.tint.eval(si, active)
+
+        def _opacity(self, si: Any, active: Any) -> Any:
+            out = mi.Float(1.0)
+            for part in (self.opacity, self.tint_alpha):
+                if part is not None:
+                    out *= part.eval_1(si, active)
+            return out
+
+        def eval_null_transmission(self, si: Any, active: Any = True) -> Any:
+            if not self.passes:
+                return mi.Color3f(0.0)
+            opacity = self._opacity(si, active)
+            through = mi.Color3f(1.0 - opacity)
+            if self.transmission is not None:
+                kept = (1.0 - self.metallic.eval_1(si, active)) * self.transmission.eval_1(si, active)
+                reflected = _schlick(dr.max(self.f0), self.f90, dr.abs(mi.Frame3f.cos_theta(si.wi)))
+                through += self._base(si, active) * (opacity * kept * (1.0 - reflected))
+            return dr.select(active, through, 0.0)
 
         def sample(self, context: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-            albedo, f0, alpha, chance = self._at(si, active)
-            cos_i = mi.Frame3f.cos_theta(si.wi)
-            active = mi.Bool(active) & (cos_i > 0.0)
-            glossy = sample1 < chance
-            half, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True).sample(si.wi, sample2)
-            wo = dr.select(glossy, mi.reflect(si.wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
-            value, pdf = _value_and_pdf(si.wi, wo, albedo, f0, alpha, chance)
-            active &= pdf > 0.0
             out = dr.zeros(mi.BSDFSample3f)
-            out.wo, out.eta = wo, 1.0
-            out.pdf = dr.select(active, pdf, 0.0)
-            out.sampled_component = dr.select(glossy, mi.UInt32(1), mi.UInt32(0))
-            out.sampled_type = dr.select(
+            out.eta = 1.0
+            straight, through = self._chance_of_passing(context, si, active)
+            passes = mi.Bool(active) & (sample1 < straight)
+            rest = 1.0 - straight
+            choice = dr.select(rest > 0.0, (sample1 - straight) / rest, 0.0)
+
+            at = self._at(si, active)
+            wi, side = self._facing(si.wi)
+            glossy = choice < at.chance
+            half, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, at.alpha, True).sample(wi, sample2)
+            wo = dr.select(glossy, mi.reflect(wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
+            value, pdf = _value_and_pdf(wi, wo, at)
+            pdf *= rest
+            reflects = mi.Bool(active) & ~passes & (wi.z > 0.0) & (pdf > 0.0)
+            out.wo = dr.select(passes, -si.wi, mi.Vector3f(wo.x, wo.y, wo.z * side))
+            out.pdf = dr.select(passes, straight, dr.select(reflects, pdf, 0.0))
+            component = dr.select(glossy, mi.UInt32(1), mi.UInt32(0))
+            out.sampled_component = dr.select(passes, mi.UInt32(2), component)
+            kind = dr.select(
                 glossy, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
             )
-            return out, dr.select(active, value / pdf, 0.0)
+            out.sampled_type = dr.select(passes, mi.UInt32(+mi.BSDFFlags.Null), kind)
+            weight = dr.select(reflects, value / pdf, 0.0)
+            return out, dr.select(passes, through / straight, weight)
 
         def eval(self, context: Any, si: Any, wo: Any, active: Any = True) -> Any:
             return self.eval_pdf(context, si, wo, active)[0]
@@ -76,8 +151,24 @@ def _register(variant: str) -> None:
             return self.eval_pdf(context, si, wo, active)[1]
 
         def eval_pdf(self, context: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            value, pdf = _value_and_pdf(si.wi, wo, *self._at(si, active))
-            return dr.select(active, value, 0.0), dr.select(active, pdf, 0.0)
+            wi, side = self._facing(si.wi)
+            value, pdf = _value_and_pdf(wi, mi.Vector3f(wo.x, wo.y, wo.z * side), self._at(si, active))
+            straight, _ = self._chance_of_passing(context, si, active)
+            return dr.select(active, value, 0.0), dr.select(active, pdf * (1.0 - straight), 0.0)
+
+        def _facing(self, wi: Any) -> tuple[Any, Any]:
+            """`wi` seen from its own side of a double-sided surface, and the sign of that side."""
+            if not self.double_sided:
+                return wi, mi.Float(1.0)
+            side = dr.select(wi.z < 0.0, mi.Float(-1.0), mi.Float(1.0))
+            return mi.Vector3f(wi.x, wi.y, wi.z * side), side
+
+        def _chance_of_passing(self, context: Any, si: Any, active: Any) -> tuple[Any, Any]:
+            """Probability by which `sample` goes straight on, and what passes [Color3f]."""
+            if not self.passes or not context.is_enabled(mi.BSDFFlags.Null, 2):
+                return mi.Float(0.0), mi.Color3f(0.0)
+            through = self.eval_null_transmission(si, active)
+            return dr.mean(through), through
 
         def traverse(self, callback: Any) -> None:
             for name in ("base_color", "roughness", "metallic"):
@@ -89,28 +180,28 @@ def _register(variant: str) -> None:
     mi.register_bsdf("kiln_gltf", KilnGltf)
 
 
-def _value_and_pdf(wi: Any, wo: Any, albedo: Any, f0: Any, alpha: Any, chance: Any) -> tuple[Any, Any]:
+def _value_and_pdf(wi: Any, wo: Any, at: _Point) -> tuple[Any, Any]:
     """BRDF times cosine [Color3f] and the density of `wo` by solid angle; 0 below the surface."""
     cos_i, cos_o = mi.Frame3f.cos_theta(wi), mi.Frame3f.cos_theta(wo)
     above = (cos_i > 0.0) & (cos_o > 0.0)
     half = dr.normalize(wi + wo)
     cos_d = dr.dot(wi, half)
-    square = dr.square(alpha)
+    square = dr.square(at.alpha)
     # sin^2 + alpha^2 cos^2 of the half vector: 1 - cos^2 would cancel for mirrors.
     spread = dr.fma(half.x, half.x, dr.fma(half.y, half.y, square * dr.square(half.z)))
     d = square * dr.inv_pi / dr.square(spread)
     # cos sqrt(1 + alpha^2 tan^2) of both directions; G2 / (4 cos_i cos_o) = 0.5 / (cos_o a + cos_i b).
     a = dr.sqrt(square + (1.0 - square) * dr.square(cos_i))
     b = dr.sqrt(square + (1.0 - square) * dr.square(cos_o))
-    specular = _schlick(f0, cos_d) * (d * 0.5 * cos_o / (cos_o * a + cos_i * b))
-    diffuse = albedo * ((1.0 - _schlick(DIELECTRIC_F0, cos_d)) * cos_o * dr.inv_pi)
+    specular = _schlick(at.f0, at.f90, cos_d) * (d * 0.5 * cos_o / (cos_o * a + cos_i * b))
+    diffuse = at.albedo * ((1.0 - _schlick(*at.dielectric, cos_d)) * cos_o * dr.inv_pi)
     # Visible normals have density D G1 (i.h) / cos_i with G1 = 2 cos_i / (cos_i + a); a reflection divides by 4 (i.h).
     glossy_pdf = 0.5 * d / (cos_i + a)
-    pdf = dr.lerp(cos_o * dr.inv_pi, glossy_pdf, chance)
-    return dr.select(above, specular + diffuse, 0.0), dr.select(above, pdf, 0.0)
+    pdf = dr.lerp(cos_o * dr.inv_pi, glossy_pdf, at.chance)
+    return dr.select(above, (specular + diffuse) * at.opacity, 0.0), dr.select(above, pdf, 0.0)
 
 
-def _schlick(f0: Any, cosine: Any) -> Any:
-    """F0 + (1 - F0) (1 - cos)^5 (Schlick 1994)."""
+def _schlick(f0: Any, f90: Any, cosine: Any) -> Any:
+    """F0 + (F90 - F0) (1 - cos)^5 (Schlick 1994)."""
     away = dr.clip(1.0 - cosine, 0.0, 1.0)
-    return f0 + (1.0 - f0) * (dr.square(dr.square(away)) * away)
+    return f0 + (f90 - f0) * (dr.square(dr.square(away)) * away)

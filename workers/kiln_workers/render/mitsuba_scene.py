@@ -6,30 +6,17 @@ and `scene.model` half a row below it; on the doubled grid both agree at every r
 sheets back to back.
 """
 
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
-from kiln_workers.render import textures
 from kiln_workers.render.backend import select_variant, watertight
-from kiln_workers.render.emitters import register_emitters
-from kiln_workers.render.gltf_bsdf import register_bsdfs
 from kiln_workers.render.jit import dr, mi
+from kiln_workers.render.materials import MaterialBuilder, vertex_attributes
 from kiln_workers.scene.geometry import Floats
-from kiln_workers.scene.model import (
-    Environment,
-    Float32,
-    LightKind,
-    Material,
-    Mesh,
-    PunctualLight,
-    Scene,
-    TextureRef,
-)
+from kiln_workers.scene.model import Environment, Float32, LightKind, Mesh, PunctualLight, Scene
 from kiln_workers.scene.precision import face_clearance
-
-MIN_ROUGHNESS: Final = 0.05
-"""Below this the GGX peak outgrows float32 and no sampler finds it; alpha 0.0025 is a mirror at any image size here."""
 
 SHEET_GAP: Final = 2.0
 """Distance between the two sheets of a double-sided emitter, in clearances of its faces."""
@@ -39,23 +26,18 @@ def to_mitsuba(scene: Scene) -> Any:
     """The `mi.Scene` of a parsed scene (variant: the one selected, else `select_variant()`'s choice)."""
     if mi.variant() is None:
         select_variant()
-    register_emitters()
-    register_bsdfs()
     powers = _EmitterPowers(scene)
     parts: dict[str, Any] = {"type": "scene", **watertight()}
-    bsdfs: dict[int, Any] = {}
+    materials = MaterialBuilder(scene)
     for number, mesh in enumerate(scene.meshes):
         if not len(mesh.faces):
             continue
         material = scene.materials[mesh.material]
-        key = mesh.material if not _needs_uv_range(material) else -1 - number
-        if key not in bsdfs:
-            bsdfs[key] = mi.load_dict(_bsdf(scene, material, mesh.uv))
-        weight = powers.mesh_weight(mesh)
-        parts[f"mesh_{number}"] = _mesh(mesh, material, bsdfs[key], _emission(scene, material, mesh, weight))
+        bsdf, weight = materials.bsdf(mesh), powers.mesh_weight(mesh)
+        parts[f"mesh_{number}"] = _mesh(mesh, bsdf, materials.emitter(mesh, weight))
         if max(material.emission) > 0.0 and material.double_sided:
             back = back_sheet(mesh, SHEET_GAP * face_clearance(mesh.positions, mesh.faces))
-            parts[f"mesh_{number}_back"] = _mesh(back, material, bsdfs[key], _emission(scene, material, back, weight))
+            parts[f"mesh_{number}_back"] = _mesh(back, bsdf, materials.emitter(back, weight))
     for number, light in enumerate(scene.lights):
         parts[f"light_{number}"] = _light(light, powers.light_weight(light))
     if scene.environment is not None:
@@ -89,15 +71,12 @@ def back_sheet(mesh: Mesh, gap: Floats) -> Mesh:
     corners = mesh.positions[mesh.faces].astype(np.float64)  # [F, 3, 3]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
-    positions = (corners - (gap[:, None] * normal)[:, None])[:, ::-1].reshape(-1, 3).astype(np.float32)
     order = mesh.faces[:, ::-1].reshape(-1)
-    return Mesh(
+    return replace(
+        mesh.with_vertices(order, np.arange(len(order), dtype=np.int32).reshape(-1, 3)),
         name=f"{mesh.name} (back)",
-        positions=positions,
+        positions=(corners - (gap[:, None] * normal)[:, None])[:, ::-1].reshape(-1, 3).astype(np.float32),
         normals=-np.repeat(normal, 3, axis=0).astype(np.float32),
-        faces=np.arange(len(positions), dtype=np.int32).reshape(-1, 3),
-        material=mesh.material,
-        uv=None if mesh.uv is None else mesh.uv[order],
     )
 
 
@@ -151,12 +130,7 @@ class _EmitterPowers:
         return environment.scale * mean * np.pi * 4.0 * np.pi * self.radius**2
 
 
-def _needs_uv_range(material: Material) -> bool:
-    used = (material.base_color_texture, material.metallic_roughness_texture, material.emission_texture)
-    return any(ref is not None and ref.wrap[0] != ref.wrap[1] for ref in used)
-
-
-def _mesh(mesh: Mesh, material: Material, bsdf: Any, emitter: Any | None) -> Any:
+def _mesh(mesh: Mesh, bsdf: Any, emitter: Any | None) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     if emitter is not None:
@@ -174,71 +148,10 @@ def _mesh(mesh: Mesh, material: Material, bsdf: Any, emitter: Any | None) -> Any
     if mesh.uv is not None:
         parameters["vertex_texcoords"] = mi.Float(np.ravel(mesh.uv).astype(np.float32))
     parameters.update()
+    for name, values in vertex_attributes(mesh).items():
+        out.add_attribute(name, values.shape[1], np.ravel(values).astype(np.float32))
     dr.eval(parameters["vertex_positions"])
     return out
-
-
-def _bsdf(scene: Scene, material: Material, uv: Float32 | None) -> dict[str, Any]:
-    # As objects: a plugin written in Python would get a nested colour as three numbers.
-    inputs = {name: mi.load_dict(texture) for name, texture in _reflectance(scene, material, uv).items()}
-    surface: dict[str, Any] = {"type": "kiln_gltf", **inputs}
-    if material.double_sided:
-        surface = {"type": "twosided", "bsdf": surface}
-    if material.alpha_cutoff is None:
-        return surface
-    return {"type": "mask", "bsdf": surface, "opacity": opacity(scene, material, uv)}
-
-
-def _reflectance(scene: Scene, material: Material, uv: Float32 | None) -> dict[str, Any]:
-    factor = np.clip(np.asarray(material.base_color[:3], np.float32), 0.0, 1.0)
-    out: dict[str, Any] = {"base_color": {"type": "rgb", "value": factor.tolist()}}
-    if material.base_color_texture is not None and uv is not None:
-        pixels = textures.linear_pixels(scene.images[material.base_color_texture.image])[..., :3] * factor
-        out["base_color"] = textures.bitmap(np.clip(pixels, 0.0, 1.0), material.base_color_texture, uv)
-    roughness = float(np.clip(material.roughness, MIN_ROUGHNESS, 1.0))
-    out["roughness"] = {"type": "uniform", "value": roughness}
-    out["metallic"] = {"type": "uniform", "value": float(np.clip(material.metallic, 0.0, 1.0))}
-    if material.metallic_roughness_texture is not None and uv is not None:
-        reference = material.metallic_roughness_texture
-        pixels = textures.linear_pixels(scene.images[reference.image])
-        rough = np.clip(pixels[..., 1:2] * np.float32(material.roughness), MIN_ROUGHNESS, 1.0)
-        metal = np.clip(pixels[..., 2:3] * np.float32(material.metallic), 0.0, 1.0)
-        out["roughness"] = textures.bitmap(rough, reference, uv)
-        out["metallic"] = textures.bitmap(metal, reference, uv)
-    return out
-
-
-def opacity(scene: Scene, material: Material, uv: Float32 | None) -> Any:
-    """The alpha test as a Mitsuba texture of zeros and ones, or a number where no texture carries alpha."""
-    cutoff, factor = material.alpha_cutoff or 0.0, float(material.base_color[3])
-    reference = material.base_color_texture
-    if reference is None or uv is None:
-        return 1.0 if factor >= cutoff else 0.0
-    alpha = textures.linear_pixels(scene.images[reference.image])[..., 3] * np.float32(factor)
-    return textures.bitmap(textures.thresholded(alpha, cutoff, reference.wrap), reference, uv, nearest=True)
-
-
-def _emission(scene: Scene, material: Material, mesh: Mesh, weight: float) -> Any | None:
-    if max(material.emission) <= 0.0:
-        return None
-    covered = 1.0 if material.alpha_cutoff is None else opacity(scene, material, mesh.uv)
-    if covered == 0.0:
-        return None
-    reference = material.emission_texture if mesh.uv is not None else None
-    if reference is None and covered == 1.0:
-        radiance = {"type": "rgb", "value": list(material.emission)}
-        return mi.load_dict({"type": "area", "radiance": radiance, "sampling_weight": weight})
-    factor = np.asarray(material.emission, np.float32)
-    if reference is None:
-        reference, pixels = TextureRef(0), np.ones((2, 2, 3), np.float32)
-    else:
-        pixels = textures.linear_pixels(scene.images[reference.image])[..., :3]
-    emitter: dict[str, Any] = {"type": "kiln_area", "sampling_weight": weight}
-    # As objects: a plugin written in Python would get a nested colour as three numbers.
-    emitter["radiance"] = mi.load_dict(textures.bitmap(np.maximum(pixels * factor, 0.0), reference, mesh.uv))
-    if isinstance(covered, dict):
-        emitter["opacity"] = mi.load_dict(covered)
-    return mi.load_dict(emitter)
 
 
 def _light(light: PunctualLight, weight: float) -> dict[str, Any]:

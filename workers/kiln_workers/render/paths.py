@@ -5,7 +5,8 @@ after another, a new path starting as soon as the last has ended, and adds them 
 atomics are needed and a result depends on nothing but its own random numbers. Paths use next-event estimation and BSDF
 sampling weighted by the power heuristic (Veach 1997, section 9.2.4) and Russian roulette from the fourth scattering on.
 Deviations from Mitsuba's `path` integrator: directions on the wrong side of the geometric surface carry nothing, where
-the interpolated normal faces away from the ray the geometric one is used, and cut-outs do not block shadow rays.
+the interpolated normal faces away from the ray the geometric one is used, and what lets light pass (cut-outs, blended
+and transmitting surfaces) dims shadow rays by what it holds back; paths meet it by chance.
 """
 
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from kiln_workers.render import counters
+from kiln_workers.render.gltf_bsdf import reflections_only
 from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.mitsuba_scene import mesh_number, to_mitsuba
 from kiln_workers.scene.model import Scene
@@ -39,7 +41,7 @@ LEAST_COSINE: Final = 0.01
 """At a grazing hit a ray steps back no further than at this cosine."""
 
 OPACITY_THRESHOLD: Final = 0.5
-"""Opacities are 0 or 1 (`textures.thresholded`)."""
+"""Where a cut-out's opacity is below it, `closest` sees nothing; alpha tests have 0 and 1 (`textures.thresholded`)."""
 
 
 @dataclass
@@ -69,7 +71,9 @@ class PathTracer:
     def __init__(self, scene: Scene, max_depth: int) -> None:
         self.scene = to_mitsuba(scene)
         self.max_depth = max_depth
-        self.has_cutouts = any(scene.materials[mesh.material].alpha_cutoff is not None for mesh in scene.meshes)
+        used = [scene.materials[mesh.material] for mesh in scene.meshes]
+        self.has_cutouts = any(material.lets_light_pass for material in used)
+        self.has_veils = any(material.is_veil for material in used)
         self._tabulate(scene)
 
     def _tabulate(self, scene: Scene) -> None:
@@ -133,16 +137,60 @@ class PathTracer:
                 through &= si.is_valid() & (self._opacity(si, through) < OPACITY_THRESHOLD) & (layers < MAX_LAYERS)
         return si
 
+    @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
+    def scattering(self, ray: Any, chance: Any, active: Any) -> tuple[Any, Any]:
+        """A hit drawn from all that let a part of the light pass, and the factor [Color3f] on what comes from there.
+
+        `chance`: a uniform number [Float]; after each surface it is stretched and used again. A surface of
+        transmittance T is passed with probability p = mean T and factor T / p, else hit with factor 1 / (1 - p), so
+        that the mean is T times what lies behind plus what the surface itself sends.
+        """
+        si = self.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        factor = mi.Color3f(1.0)
+        layers, searching = mi.UInt32(0), active & si.is_valid()
+        while searching:
+            through = si.bsdf().eval_null_transmission(si, searching)
+            share = dr.select(layers < MAX_LAYERS, dr.mean(through), 0.0)
+            passes = searching & (chance < share)
+            hit = searching & ~passes
+            factor = dr.select(passes, factor * through / share, dr.select(hit, factor / (1.0 - share), factor))
+            chance = dr.select(passes, chance / share, chance)
+            onwards = mi.Ray3f(self.beyond(si, ray.d), ray.d)
+            behind = self.scene.ray_intersect(onwards, mi.RayFlags.All, False, passes)
+            si = dr.select(passes, behind, si)
+            layers += 1
+            searching = passes & si.is_valid()
+        return si, factor
+
+    @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
+    def passing(self, ray: Any, active: Any) -> Any:
+        """The part [Color3f] of the light that passes all surfaces before the ray's `maxt`."""
+        si = self.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        passed = mi.Color3f(1.0)
+        layers, searching = mi.UInt32(0), active & si.is_valid()
+        while searching:
+            through = si.bsdf().eval_null_transmission(si, searching)
+            passed = dr.select(searching, passed * dr.select(layers < MAX_LAYERS, through, 0.0), passed)
+            searching &= dr.max(passed) > 0.0
+            onwards = mi.Ray3f(self.beyond(si, ray.d), ray.d)
+            onwards.maxt = ray.maxt - dr.norm(onwards.o - ray.o)
+            si = dr.select(searching, self.scene.ray_intersect(onwards, mi.RayFlags.All, False, searching), si)
+            layers += 1
+            searching &= si.is_valid()
+        return passed
+
     def _opacity(self, si: Any, active: Any) -> Any:
         return 1.0 - dr.mean(si.bsdf().eval_null_transmission(si, active))
 
-    def occluded(self, origin: Any, target: Any, active: Any) -> Any:
-        """Whether an opaque surface lies between two points."""
+    def unoccluded(self, origin: Any, target: Any, active: Any) -> Any:
+        """The part [Color3f] of the light that gets from one point to another."""
         segment = target - origin
         distance = dr.norm(segment)
         ray = mi.Ray3f(origin, segment / distance)
         ray.maxt = dr.maximum(distance * (1.0 - SHADOW_SLACK) - self.emitter_clearance, 0.0)
-        return self.blocked(ray, active)
+        if self.has_veils:
+            return self.passing(ray, active)
+        return dr.select(self.blocked(ray, active), mi.Color3f(0.0), mi.Color3f(1.0))
 
     def blocked(self, ray: Any, active: Any) -> Any:
         """Whether the ray meets an opaque surface before its `maxt`."""
@@ -151,10 +199,10 @@ class PathTracer:
         return self.closest(ray, active).is_valid()
 
     def light_at(self, si: Any, sample: Any, active: Any) -> tuple[Any, Any]:
-        """Next-event estimation at a point off a surface: direction sample, and unoccluded radiance / pdf."""
+        """Next-event estimation at a point off a surface: direction sample, and what arrives of radiance / pdf."""
         ds, weight = self.scene.sample_emitter_direction(si, sample, False, active)
         active = active & (ds.pdf != 0.0) & (dr.max(weight) > 0.0)
-        active &= ~self.occluded(si.p, ds.p, active)
+        weight *= self.unoccluded(si.p, ds.p, active)
         return ds, dr.select(active, weight, 0.0)
 
     @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
@@ -189,7 +237,12 @@ class PathTracer:
             depth = dr.select(fresh, 0, depth)
 
             ray = mi.Ray3f(origin, direction)
-            si = self.closest(ray, on_path)
+            if dr.hint(self.has_veils, mode="scalar"):
+                state, chance = counters.pair(state)
+                si, factor = self.scattering(ray, chance.x, on_path)
+                throughput *= factor
+            else:
+                si = self.closest(ray, on_path)
             self._orient(si, ray)
             thin = dr.gather(mi.UInt32, self.double_sided, dr.reinterpret_array(mi.UInt32, si.shape), si.is_valid())
             behind = si.is_valid() & (dr.dot(si.n, direction) > 0.0) & (thin == 0)
@@ -204,7 +257,7 @@ class PathTracer:
             # Continue in a direction drawn from the BSDF.
             state, u = counters.pair(state)
             state, choice = counters.pair(state)
-            scattered, factor = si.bsdf().sample(mi.BSDFContext(), si, choice.x, u, scatters)
+            scattered, factor = si.bsdf().sample(reflections_only(), si, choice.x, u, scatters)
             onwards = si.to_world(scattered.wo)
             scatters &= dr.dot(si.n, onwards) * dr.dot(si.n, direction) < 0.0
             throughput *= factor
@@ -270,7 +323,7 @@ class PathTracer:
         Weighted against BSDF sampling.
         """
         ds, arriving = self.light_at(si, sample, active)
-        value, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+        value, pdf = si.bsdf().eval_pdf(reflections_only(), si, si.to_local(ds.d), active)
         same_side = dr.dot(si.n, ds.d) * dr.dot(si.n, direction) < 0.0
         share = dr.select(ds.delta, 1.0, _power_heuristic(ds.pdf, pdf))
         return dr.select(active & same_side, value * arriving * share, 0.0)

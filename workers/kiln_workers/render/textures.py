@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from kiln_schemas.errors import TooLarge
 from kiln_workers.render.jit import mi
-from kiln_workers.scene.model import Float32, Image, TextureRef
+from kiln_workers.scene.model import Float32, TextureRef
 
 Floats = npt.NDArray[np.float64]
 
@@ -23,20 +23,6 @@ LARGEST_UNROLLED: Final = 1 << 26
 
 OPACITY_OVERSAMPLING: Final = 4
 """An alpha-tested texture is magnified by this factor before the test, so that its edges are not blocky."""
-
-
-def linear_pixels(image: Image) -> Float32:
-    """The image as linear float32 RGBA [H, W, 4]; grey is spread over RGB, absent alpha is 1."""
-    values = image.pixels.astype(np.float32)
-    if image.pixels.dtype == np.uint8:
-        values /= np.float32(255.0)
-    channels = values.shape[-1]
-    rgb = values[..., :1].repeat(3, axis=-1) if channels <= 2 else values[..., :3]
-    if image.srgb:
-        # IEC 61966-2-1.
-        rgb = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    alpha = values[..., -1:] if channels in (2, 4) else np.ones_like(values[..., :1])
-    return np.concatenate([rgb, alpha], axis=-1).astype(np.float32)
 
 
 def uv_matrix(reference: TextureRef) -> Floats:

@@ -93,21 +93,25 @@ class RayTable:
 def trace_visibility(
     tracer: PathTracer, table: RayTable, texel_hash: Any, pixels: Any, origin: Any, normal: Any
 ) -> tuple[Any, Any]:
-    """Fractions of each lane's rays that are above the horizon and not occluded, and that are above the horizon."""
+    """Of each lane's rays the mean that is above the horizon and not occluded (Color3f where surfaces may let a part of
+    the light pass, else Float), and the fraction above the horizon."""
     ray = dr.gather(mi.UInt32, table.first, pixels)
     rays = dr.gather(mi.UInt32, table.rays, pixels)
     last = ray + rays
     directions = table.directions
     shift = mi.UInt32(texel_hash % VARIANTS) * table.count
-    seen, above = dr.zeros(mi.UInt32, dr.width(pixels)), dr.zeros(mi.UInt32, dr.width(pixels))
+    above = dr.zeros(mi.UInt32, dr.width(pixels))
+    seen = dr.zeros(mi.Color3f if tracer.has_veils else mi.Float, dr.width(pixels))
     while ray < last:
         direction = dr.gather(mi.Vector3f, directions, shift + ray)
         up = dr.dot(direction, normal) > 0.0
         above += dr.select(up, 1, 0)
-        free = up & ~tracer.blocked(mi.Ray3f(origin, direction), up)
-        seen += dr.select(free, 1, 0)
+        if dr.hint(tracer.has_veils, mode="scalar"):
+            seen += dr.select(up, tracer.passing(mi.Ray3f(origin, direction), up), 0.0)
+        else:
+            seen += dr.select(up & ~tracer.blocked(mi.Ray3f(origin, direction), up), 1.0, 0.0)
         ray += 1
-    return mi.Float(seen) / mi.Float(rays), mi.Float(above) / mi.Float(rays)
+    return seen / mi.Float(rays), mi.Float(above) / mi.Float(rays)
 
 
 def weighted_visibility(
@@ -171,7 +175,9 @@ def _sources(
 ) -> tuple[Int64, Float32, Float32, Int64, Int64]:
     """Pixels [S] of the grid above the horizon, by texel; their energy seen and unoccluded [S, 4]; texels' ranges."""
     energy = table.energy[lanes[:, 1]]
-    numerator, denominator = energy * seen[:, None], energy * above[:, None]
+    if seen.ndim == 2:  # [3, L]
+        seen = np.concatenate([seen, seen.mean(axis=0, keepdims=True)]).T
+    numerator, denominator = energy * seen.reshape(len(energy), -1), energy * above[:, None]
     texel, pixel = lanes[:, 0], lanes[:, 1]
     if grid < size:
         step = size // grid

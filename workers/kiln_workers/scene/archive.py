@@ -10,10 +10,11 @@ from dataclasses import asdict, replace
 from typing import Any, Final
 
 import numpy as np
-from pydantic import BaseModel, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from kiln_schemas.errors import InputError
 from kiln_workers.scene.container import Array, chunks, pack, unpack
+from kiln_workers.scene.limits import MAX_UV_SETS
 from kiln_workers.scene.model import Environment, Image, Material, Mesh, PunctualLight, Scene
 
 KIND: Final = "scene"
@@ -24,6 +25,7 @@ LIGHTS: Final = TypeAdapter(list[PunctualLight])
 class _MeshEntry(BaseModel):
     name: str
     material: int
+    more_uv: int = Field(default=0, ge=0, le=MAX_UV_SETS)
 
 
 class _ImageEntry(BaseModel):
@@ -111,6 +113,9 @@ def _parts(scene: Scene) -> tuple[dict[str, Any], dict[str, Array]]:
             arrays[f"mesh{i}.uv"] = mesh.uv
         if mesh.lightmap_uv is not None:
             arrays[f"mesh{i}.lightmap_uv"] = mesh.lightmap_uv
+        if mesh.colors is not None:
+            arrays[f"mesh{i}.colors"] = mesh.colors
+        arrays |= {f"mesh{i}.uv{number}": values for number, values in enumerate(mesh.more_uv, start=1)}
     for i, image in enumerate(scene.images):
         arrays[f"image{i}"] = image.pixels
     environment = None
@@ -121,7 +126,9 @@ def _parts(scene: Scene) -> tuple[dict[str, Any], dict[str, Array]]:
             "rotation_deg": float(scene.environment.rotation_deg),
         }
     body = {
-        "meshes": [{"name": mesh.name, "material": mesh.material} for mesh in scene.meshes],
+        "meshes": [
+            {"name": mesh.name, "material": mesh.material, "more_uv": len(mesh.more_uv)} for mesh in scene.meshes
+        ],
         "materials": [asdict(material) for material in scene.materials],
         "images": [{"name": image.name, "srgb": image.srgb} for image in scene.images],
         "lights": [asdict(light) for light in scene.lights],
@@ -147,22 +154,16 @@ def _mesh(arrays: dict[str, Array], index: int, entry: _MeshEntry) -> Mesh:
         material=entry.material,
         uv=_floats(arrays, f"{key}.uv", (count, 2)) if f"{key}.uv" in arrays else None,
         lightmap_uv=_floats(arrays, f"{key}.lightmap_uv", (count, 2)) if f"{key}.lightmap_uv" in arrays else None,
+        more_uv=tuple(_floats(arrays, f"{key}.uv{number}", (count, 2)) for number in range(1, 1 + entry.more_uv)),
+        colors=_floats(arrays, f"{key}.colors", (count, 4)) if f"{key}.colors" in arrays else None,
     )
 
 
 def _check_references(scene: Scene) -> None:
     _check_range("a mesh's material", (mesh.material for mesh in scene.meshes), len(scene.materials))
-    textures = (
-        reference.image
-        for material in scene.materials
-        for reference in (
-            material.base_color_texture,
-            material.metallic_roughness_texture,
-            material.emission_texture,
-        )
-        if reference is not None
-    )
-    _check_range("a texture's image", textures, len(scene.images))
+    references = [reference for material in scene.materials for reference in material.textures]
+    _check_range("a texture's image", (reference.image for reference in references), len(scene.images))
+    _check_range("a texture's UV set", (reference.uv_set for reference in references), MAX_UV_SETS)
 
 
 def _check_range(what: str, values: Iterable[int], count: int) -> None:

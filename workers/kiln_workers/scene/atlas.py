@@ -222,6 +222,7 @@ def _split(mesh: Mesh, part: Unwrapped, lightmap_uv: Floats) -> Mesh:
     length = np.linalg.norm(taken["normals"], axis=1, keepdims=True)
     between = (part.share > 0.0)[:, None] & (length > 1e-12)
     taken["normals"] = np.where(between, taken["normals"] / np.maximum(length, 1e-12), taken["normals"])
+    taken["more_uv"] = tuple(points(values, part).astype(values.dtype) for values in mesh.more_uv)
     taken |= {"faces": part.faces.astype(np.int32), "lightmap_uv": lightmap_uv.astype(np.float32)}
     return replace(mesh, **taken)
 

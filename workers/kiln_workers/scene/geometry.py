@@ -15,7 +15,7 @@ import numpy.typing as npt
 from kiln_schemas.errors import InputError
 from kiln_schemas.text import told
 from kiln_workers.scene.limits import MAX_COORDINATE, MAX_MESHES, MAX_TRIANGLES, NAME_LENGTH, check_count
-from kiln_workers.scene.model import Mesh
+from kiln_workers.scene.model import Float32, Mesh
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -35,6 +35,8 @@ class RawMesh:
     normals: Floats | None = None  # [V, 3], any length
     uv: Floats | None = None  # [V, 2], v downwards
     lightmap_uv: Floats | None = None  # [V, 2]
+    more_uv: tuple[Floats, ...] = ()  # [V, 2] each
+    colors: Floats | None = None  # [V, 4] linear RGBA
 
 
 def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, list[str]]:
@@ -64,16 +66,12 @@ def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, l
     faces = faces[keep]
     used, compact = np.unique(faces, return_inverse=True)
     faces = compact.reshape(-1, 3)
-    positions = positions[used]
-    uv = _picked(raw.uv, used)
-    lightmap_uv = _picked(raw.lightmap_uv, used)
     if raw.normals is None:
-        corners = faces.reshape(-1)
-        positions = positions[corners]
-        uv, lightmap_uv = _picked(uv, corners), _picked(lightmap_uv, corners)
-        faces = np.arange(len(corners)).reshape(-1, 3)
+        used, faces = used[faces.reshape(-1)], np.arange(faces.size).reshape(-1, 3)
+        positions = positions[used]
         normals = np.repeat(face_normals(positions, faces), 3, axis=0)
     else:
+        positions = positions[used]
         normals, mended = _transformed_normals(raw.normals[used], linear, positions, faces)
         if mended:
             notes.append(f"Mesh '{raw.name}': {mended} unusable vertex normals replaced by those of its faces.")
@@ -83,8 +81,10 @@ def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, l
         normals=normals.astype(np.float32),
         faces=faces.astype(np.int32),
         material=raw.material,
-        uv=None if uv is None else uv.astype(np.float32),
-        lightmap_uv=None if lightmap_uv is None else lightmap_uv.astype(np.float32),
+        uv=_picked(raw.uv, used),
+        lightmap_uv=_picked(raw.lightmap_uv, used),
+        more_uv=tuple(values[used].astype(np.float32) for values in raw.more_uv),
+        colors=_picked(raw.colors, used),
     )
     return mesh, notes
 
@@ -170,9 +170,13 @@ def _check(raw: RawMesh) -> None:
             where=_where(raw),
             remedy="Export the mesh again.",
         )
-    for label, uv in (("UV", raw.uv), ("light-map UV", raw.lightmap_uv)):
-        if uv is not None and not np.isfinite(uv).all():
-            vertex = int(np.argmax(~np.isfinite(uv).all(axis=1)))
+    attributes = [("UV", uv) for uv in (raw.uv, *raw.more_uv)] + [
+        ("light-map UV", raw.lightmap_uv),
+        ("colour", raw.colors),
+    ]
+    for label, values in attributes:
+        if values is not None and not np.isfinite(values).all():
+            vertex = int(np.argmax(~np.isfinite(values).all(axis=1)))
             raise InputError(f"the {label} of vertex {vertex} is not a finite number", where=_where(raw))
 
 
@@ -186,8 +190,8 @@ def _check_rows(good: npt.ArrayLike, raw: RawMesh, what: str) -> None:
         )
 
 
-def _picked(values: Floats | None, rows: Ints) -> Floats | None:
-    return None if values is None else values[rows]
+def _picked(values: Floats | None, rows: Ints) -> Float32 | None:
+    return None if values is None else values[rows].astype(np.float32)
 
 
 def _where(raw: RawMesh) -> str:

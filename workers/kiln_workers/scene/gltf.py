@@ -1,22 +1,20 @@
-"""Reader of glTF 2.0 and GLB: meshes under node transforms, metallic-roughness materials, textures, punctual lights.
+"""Reader of glTF 2.0 and GLB: meshes under node transforms, skins and morph targets at rest, materials, lights.
 
-Khronos glTF 2.0 with KHR_materials_emissive_strength, KHR_lights_punctual, KHR_texture_transform,
-KHR_mesh_quantization, KHR_materials_unlit and EXT_mesh_gpu_instancing. Read by an own reader over pydantic models
-(`gltf_document`), as general loaders drop TEXCOORD_1 or believe a stranger's offsets. What the method has no use for
-is ignored with a note; a *required* extension that is not in the list is refused by name. Photometric and
-radiometric units of lights are taken one to one, as renderers of glTF do (candela as W/sr, lux as W/m^2).
+Read by an own reader over pydantic models (`gltf_document`), as general loaders drop TEXCOORD_1 or believe a stranger's
+offsets. docs/scene-input.md says what becomes of each feature and extension; what the method has no use for is ignored
+with a note. Photometric and radiometric units of lights are taken one to one, as renderers of glTF do (candela as W/sr,
+lux as W/m^2).
 """
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
 from kiln_schemas.errors import InputError
-from kiln_schemas.text import QUOTE_LENGTH, told
 from kiln_workers.scene.bundle import BundleFolder
+from kiln_workers.scene.container import Array
 from kiln_workers.scene.geometry import (
     Floats,
     Ints,
@@ -27,32 +25,25 @@ from kiln_workers.scene.geometry import (
     unique_names,
 )
 from kiln_workers.scene.gltf_buffers import GltfBuffers, split_glb
+from kiln_workers.scene.gltf_compression import decode_draco
+from kiln_workers.scene.gltf_deform import Influences, influences, joint_matrices, morphed, skinned
 from kiln_workers.scene.gltf_document import (
     Document,
+    Draco,
     Instancing,
     LightIndex,
     Lights,
     Node,
     Primitive,
+    Visibility,
     parse_document,
     parse_extension,
     pick,
 )
+from kiln_workers.scene.gltf_extensions import check_extensions
 from kiln_workers.scene.gltf_materials import MaterialTable
-from kiln_workers.scene.limits import NAME_LENGTH
 from kiln_workers.scene.model import LightKind, Mesh, PunctualLight, Scene
 
-READ_EXTENSIONS: Final = frozenset(
-    {
-        "KHR_materials_emissive_strength",
-        "KHR_lights_punctual",
-        "KHR_texture_transform",
-        "KHR_mesh_quantization",
-        "KHR_materials_unlit",
-        "EXT_mesh_gpu_instancing",
-    }
-)
-HARMLESS: Final = frozenset({"KHR_xmp", "KHR_xmp_json_ld", "KHR_materials_variants", "KHR_node_visibility"})
 TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
@@ -68,8 +59,26 @@ def read_gltf(folder: Path, entry: str) -> Scene:
 class _Placed:
     """A node with its transform to the world."""
 
+    index: int
     node: Node
     matrix: Floats
+    visible: bool
+
+
+@dataclass
+class _Part:
+    """A primitive, and the joints and weights of its vertices."""
+
+    raw: RawMesh
+    influence: Influences | None
+
+
+@dataclass
+class _Draco:
+    """A primitive's decoded Draco buffer."""
+
+    attributes: dict[str, Array]  # [V, C]
+    faces: Ints  # [F, 3]
 
 
 @dataclass
@@ -79,9 +88,11 @@ class _Reader:
     entry: str
     notes: list[str] = field(default_factory=list)
     ignored: Counter[str] = field(default_factory=Counter)
+    hidden: int = 0
 
     def read(self) -> Scene:
-        self._check_extensions()
+        document = self.document
+        self.notes += check_extensions(document.extensions_used, document.extensions_required, self.entry)
         materials = MaterialTable(self.document, self.buffers, self.notes)
         placed = self._placed_nodes()
         meshes: list[Mesh] = []
@@ -92,6 +103,8 @@ class _Reader:
         self.notes += [f"'{self.entry}': {what} ({count}) ignored." for what, count in sorted(self.ignored.items())]
         if self.document.animations:
             self.notes.append(f"'{self.entry}': animations ignored; the scene is baked in its rest pose.")
+        if self.hidden:
+            self.notes.append(f"'{self.entry}': {self.hidden} hidden nodes left out.")
         return Scene(
             meshes=tuple(meshes),
             materials=tuple(materials.materials),
@@ -99,23 +112,6 @@ class _Reader:
             lights=tuple(self._lights(placed)),
             notes=tuple(self.notes),
         )
-
-    def _check_extensions(self) -> None:
-        if not self.document.asset.version.startswith("2."):
-            raise InputError(
-                f"is glTF {told(self.document.asset.version, QUOTE_LENGTH)}",
-                where=self.entry,
-                remedy="Export it as glTF 2.0.",
-            )
-        for name in self.document.extensions_required:
-            if name not in READ_EXTENSIONS:
-                raise InputError(
-                    f"requires the extension {told(name, NAME_LENGTH)}, which is not read",
-                    where=self.entry,
-                    remedy="Export it without this extension (uncompressed geometry, PNG or JPEG textures).",
-                )
-        for name in sorted(set(self.document.extensions_used) - READ_EXTENSIONS - HARMLESS):
-            self.notes.append(f"'{self.entry}': extension {told(name, NAME_LENGTH)} ignored.")
 
     def _placed_nodes(self) -> list[_Placed]:
         """Nodes of the scene, depth first, each with its world transform; a node reached twice is refused."""
@@ -127,9 +123,9 @@ class _Reader:
             roots = [index for index in range(len(document.nodes)) if index not in children]
         seen: set[int] = set()
         out: list[_Placed] = []
-        stack = [(index, np.eye(4)) for index in reversed(roots)]
+        stack = [(index, np.eye(4), True) for index in reversed(roots)]
         while stack:
-            index, parent = stack.pop()
+            index, parent, visible = stack.pop()
             if index in seen:
                 raise InputError(
                     f"node {index} is reached twice: a cycle, or two parents",
@@ -144,33 +140,41 @@ class _Reader:
                 raise InputError(
                     f"the transform of node {index} '{node.name}' is not finite", where=self.entry, remedy="Mend it."
                 )
-            out.append(_Placed(node, matrix))
-            stack += [(child, matrix) for child in reversed(node.children)]
+            content = node.extensions.get("KHR_node_visibility", {})
+            visible &= parse_extension(Visibility, content, f"{self.entry}: KHR_node_visibility").visible
+            self.hidden += not visible
+            out.append(_Placed(index, node, matrix, visible))
+            stack += [(child, matrix, visible) for child in reversed(node.children)]
         return out
 
     def _instances(self, placed: list[_Placed], materials: MaterialTable) -> list[tuple[RawMesh, Floats]]:
         """Every primitive of every instance with its transform; triangles are counted before anything is copied."""
-        primitives: dict[int, list[RawMesh]] = {}
+        primitives: dict[tuple[int, tuple[float, ...]], list[_Part]] = {}
+        worlds = {item.index: item.matrix for item in placed}
         pairs: list[tuple[RawMesh, Floats]] = []
         triangles = instances = 0
         for item in placed:
             index = item.node.mesh
-            if index is None:
+            if index is None or not item.visible:
                 continue
-            if index not in primitives:
-                primitives[index] = self._primitives(index, materials)
-            if item.node.skin is not None:
-                self.ignored["skinning"] += 1
-            matrices = self._instance_matrices(item, instances)
+            key = (index, tuple(item.node.weights))
+            if key not in primitives:
+                primitives[key] = self._primitives(index, key[1], materials)
+            parts, matrices = primitives[key], self._instance_matrices(item, instances)
             instances += len(matrices)
-            for matrix in matrices:
-                for raw in primitives[index]:
-                    triangles += len(raw.faces)
-                    check_triangle_count(triangles, self.entry)
-                    check_mesh_count(len(pairs) + 1, self.entry)
-                    suffix = raw.name[raw.name.rfind("/") :] if len(primitives[index]) > 1 else ""
-                    name = item.node.name + suffix if item.node.name else raw.name
-                    pairs.append((replace(raw, name=name), matrix))
+            for part in parts:
+                # Counted before anything is copied.
+                triangles += len(part.raw.faces) * len(matrices)
+                check_triangle_count(triangles, self.entry)
+                check_mesh_count(len(pairs) + len(matrices), self.entry)
+                suffix = part.raw.name[part.raw.name.rfind("/") :] if len(parts) > 1 else ""
+                raw = replace(part.raw, name=item.node.name + suffix if item.node.name else part.raw.name)
+                if item.node.skin is not None and part.influence is not None:
+                    skin = pick(self.document.skins, item.node.skin, "skin", self.entry)
+                    joints = joint_matrices(skin, item.node.skin, worlds, self.buffers, self.entry)
+                    pairs.append((skinned(raw, part.influence, joints), np.eye(4)))
+                else:
+                    pairs += [(raw, matrix) for matrix in matrices]
         names = unique_names(raw.name for raw, _ in pairs)
         return [(replace(raw, name=name), matrix) for name, (raw, matrix) in zip(names, pairs, strict=True)]
 
@@ -202,58 +206,104 @@ class _Reader:
         scale = parts.get("SCALE", np.ones((count, 3)))
         return [item.matrix @ _trs(translation[i], rotation[i], scale[i]) for i in range(count)]
 
-    def _primitives(self, mesh_index: int, materials: MaterialTable) -> list[RawMesh]:
-        part = pick(self.document.meshes, mesh_index, "mesh", self.entry)
-        name = part.name or f"mesh {mesh_index}"
+    def _primitives(self, index: int, weights: tuple[float, ...], materials: MaterialTable) -> list[_Part]:
+        part = pick(self.document.meshes, index, "mesh", self.entry)
+        name = part.name or f"mesh {index}"
         several = len(part.primitives) > 1
         out = []
         for number, primitive in enumerate(part.primitives):
-            raw = self._primitive(primitive, f"{name}/{number}" if several else name, materials)
-            out += [raw] if raw is not None else []
+            title = f"{name}/{number}" if several else name
+            if primitive.mode not in (TRIANGLES, STRIP, FAN):
+                self.ignored["primitives of points or lines"] += 1
+            elif "POSITION" not in primitive.attributes:
+                self.ignored["primitives without positions"] += 1
+            else:
+                out.append(self._primitive(primitive, title, weights or tuple(part.weights), materials))
         return out
 
-    def _primitive(self, primitive: Primitive, name: str, materials: MaterialTable) -> RawMesh | None:
-        if primitive.mode not in (TRIANGLES, STRIP, FAN):
-            self.ignored["primitives of points or lines"] += 1
-            return None
-        if "POSITION" not in primitive.attributes:
-            self.ignored["primitives without positions"] += 1
-            return None
-        if primitive.targets:
-            self.ignored["morph targets"] += 1
-        if "COLOR_0" in primitive.attributes:
-            self.ignored["vertex colours"] += 1
-        positions = self.buffers.floats(primitive.attributes["POSITION"], 3, f"POSITION of mesh '{name}'")
-        order = (
-            self.buffers.indices(primitive.indices)
-            if primitive.indices is not None
-            else np.arange(len(positions), dtype=np.int64)
-        )
-        material, uv_set = materials.use(primitive.material, name)
+    def _primitive(
+        self, primitive: Primitive, name: str, weights: tuple[float, ...], materials: MaterialTable
+    ) -> _Part:
+        packed = self._draco(primitive, name)
+        positions = self._read(primitive, packed, "POSITION", 3, name)
+        if packed is not None:
+            order = packed.faces.reshape(-1)
+        elif primitive.indices is not None:
+            order = self.buffers.indices(primitive.indices)
+        else:
+            order = np.arange(len(positions), dtype=np.int64)
+        material, sets = materials.use(primitive.material, name)
         used: Ints | slice = slice(None)
         if len(positions) > 2 * len(order) > 0 and order.max() < len(positions):
             # Primitives may share one large vertex buffer: each keeps its own vertices only.
             used, order = np.unique(order, return_inverse=True)
 
         def attribute(key: str, width: int) -> Floats | None:
-            values = self._attribute(primitive, key, width, name, len(positions))
-            return None if values is None else values[used]
+            if key not in primitive.attributes:
+                return None
+            values = self._read(primitive, packed, key, width, name, len(positions))
+            if key in ("POSITION", "NORMAL"):
+                values = morphed(values, key, primitive, weights, self.buffers, name)
+            return np.asarray(values[used])
 
-        return RawMesh(
+        uv = [attribute(f"TEXCOORD_{number}", 2) for number in sets]
+        if any(values is not None for values in uv):
+            uv = [np.zeros((len(positions), 2))[used] if values is None else values for values in uv]
+        moved = attribute("POSITION", 3)
+        assert moved is not None
+        influence = influences(primitive, self.buffers, name, len(positions))
+        raw = RawMesh(
             name=name,
-            positions=positions[used],
-            faces=_triangulated(order, primitive.mode),
+            positions=moved,
+            faces=order.reshape(-1, 3) if packed is not None else _triangulated(order, primitive.mode),
             material=material,
             normals=attribute("NORMAL", 3),
-            uv=attribute(f"TEXCOORD_{uv_set}", 2),
+            uv=uv[0],
             lightmap_uv=attribute("TEXCOORD_1", 2),
+            more_uv=tuple(values for values in uv[1:] if values is not None),
+            colors=self._colors(primitive, packed, name, len(positions), used),
         )
+        return _Part(raw, None if influence is None else (influence[0][used], influence[1][used]))
 
-    def _attribute(self, primitive: Primitive, key: str, width: int, name: str, count: int) -> Floats | None:
-        if key not in primitive.attributes:
+    def _colors(
+        self, primitive: Primitive, packed: _Draco | None, name: str, count: int, used: Ints | slice
+    ) -> Floats | None:
+        """COLOR_0 as linear RGBA in [0, 1]."""
+        if "COLOR_0" not in primitive.attributes:
             return None
-        values = self.buffers.floats(primitive.attributes[key], width, f"{key} of mesh '{name}'")
-        if len(values) != count:
+        width = self.buffers.width(primitive.attributes["COLOR_0"])
+        values = self._read(primitive, packed, "COLOR_0", min(max(width, 3), 4), name, count)[used]
+        alpha = values[:, 3:] if width == 4 else np.ones((len(values), 1))
+        return np.asarray(np.clip(np.concatenate([values[:, :3], alpha], axis=1), 0.0, 1.0))
+
+    def _draco(self, primitive: Primitive, name: str) -> _Draco | None:
+        """What KHR_draco_mesh_compression holds, whether the file requires it or only uses it."""
+        content = primitive.extensions.get("KHR_draco_mesh_compression")
+        if content is None:
+            return None
+        draco = parse_extension(Draco, content, f"{self.entry}: KHR_draco_mesh_compression")
+        unknown = sorted(set(draco.attributes) - set(primitive.attributes))
+        if unknown or "POSITION" not in draco.attributes:
+            what = f"names {unknown[0]}, which the primitive lacks" if unknown else "has no POSITION"
+            raise InputError(f"its Draco buffer {what}", where=f"mesh '{name}'", remedy="Export it again.")
+        return _Draco(*decode_draco(bytes(self.buffers.view(draco.buffer_view)), draco.attributes, name))
+
+    def _read(
+        self, primitive: Primitive, packed: _Draco | None, key: str, width: int, name: str, count: int | None = None
+    ) -> Floats:
+        """An attribute [count, width], from the Draco buffer where that has it."""
+        accessor = primitive.attributes[key]
+        if packed is not None and key in packed.attributes:
+            values = self.buffers.scaled(accessor, packed.attributes[key])
+            if values.shape[1] != width:
+                raise InputError(
+                    f"its Draco buffer has {values.shape[1]} components of {key}, not {width}",
+                    where=f"mesh '{name}'",
+                    remedy="Export it again.",
+                )
+        else:
+            values = self.buffers.floats(accessor, width, f"{key} of mesh '{name}'")
+        if count is not None and len(values) != count:
             raise InputError(
                 f"{key} has {len(values)} values for {count} vertices",
                 where=f"mesh '{name}'",
@@ -267,7 +317,7 @@ class _Reader:
         out = []
         for item in placed:
             content = item.node.extensions.get("KHR_lights_punctual")
-            if content is None:
+            if content is None or not item.visible:
                 continue
             light = pick(table, parse_extension(LightIndex, content, where).light, "light", where)
             direction = item.matrix[:3, :3] @ np.array([0.0, 0.0, -1.0])

@@ -8,7 +8,7 @@ import base64
 import binascii
 import struct
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 from urllib.parse import unquote
 
 import numpy as np
@@ -17,12 +17,14 @@ import numpy.typing as npt
 from kiln_schemas.errors import InputError
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.container import Array
-from kiln_workers.scene.gltf_document import Accessor, Document, pick
+from kiln_workers.scene.gltf_compression import decode_meshopt
+from kiln_workers.scene.gltf_document import Accessor, Document, Meshopt, parse_extension, pick
 from kiln_workers.scene.limits import MAX_READ_BYTES, MAX_VERTICES, MAX_ZEROS, check_count
 
 COMPONENTS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 DTYPES: Final = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 
+MESHOPT: Final = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 GLB_MAGIC: Final = b"glTF"
 CHUNK_JSON: Final = 0x4E4F534A
 CHUNK_BIN: Final = 0x004E4942
@@ -74,6 +76,7 @@ class GltfBuffers:
     binary: bytes | None
     _loaded: dict[int, memoryview] = field(default_factory=dict)
     _files: dict[str, bytes] = field(default_factory=dict)
+    _decoded: dict[int, bytes] = field(default_factory=dict)
 
     def file(self, uri: str, what: str) -> bytes:
         """The bytes behind a URI: inline data or a file of the bundle."""
@@ -85,6 +88,9 @@ class GltfBuffers:
         """The bytes of a buffer view."""
         where = self.folder.origin
         view = pick(self.document.buffer_views, index, "buffer view", where)
+        packed = next((view.extensions[name] for name in MESHOPT if name in view.extensions), None)
+        if packed is not None:
+            return self._unpacked(index, packed)
         data = self._buffer(view.buffer)
         if view.byte_offset + view.byte_length > len(data):
             raise _broken(
@@ -93,14 +99,31 @@ class GltfBuffers:
             )
         return data[view.byte_offset : view.byte_offset + view.byte_length]
 
+    def _unpacked(self, index: int, content: dict[str, Any]) -> memoryview:
+        """The bytes of a buffer view that meshopt compresses; each is decoded once."""
+        if index not in self._decoded:
+            where = self.folder.origin
+            view = parse_extension(Meshopt, content, f"{where}: {MESHOPT[0]}")
+            data = self._buffer(view.buffer)
+            if view.byte_offset + view.byte_length > len(data):
+                raise _broken(f"the compressed bytes of buffer view {index} leave their buffer", where)
+            part = data[view.byte_offset : view.byte_offset + view.byte_length]
+            self._decoded[index] = decode_meshopt(part, view, index, where)
+            read = sum(map(len, self._decoded.values()))
+            check_count(read, MAX_READ_BYTES, "bytes in its compressed buffers", where)
+        return memoryview(self._decoded[index])
+
+    def width(self, index: int) -> int:
+        """Components of an element of accessor `index`."""
+        return COMPONENTS[pick(self.document.accessors, index, "accessor", self.folder.origin).type]
+
+    def scaled(self, index: int, values: Array) -> npt.NDArray[np.float64]:
+        """`values` as accessor `index` would have them: integers mapped to [0, 1] or [-1, 1] where it is normalised."""
+        return _scaled(pick(self.document.accessors, index, "accessor", self.folder.origin), values)
+
     def floats(self, index: int, width: int, what: str) -> npt.NDArray[np.float64]:
         """Accessor `index` as [count, width], normalised integers mapped to [0, 1] or [-1, 1]."""
-        accessor, values = self._read(index, width, what)
-        out = values.astype(np.float64)
-        if accessor.component_type == 5126 or not accessor.normalized:
-            return out
-        largest = np.iinfo(np.dtype(DTYPES[accessor.component_type])).max
-        return np.asarray(np.maximum(out / largest, -1.0))
+        return _scaled(*self._read(index, width, what))
 
     def indices(self, index: int) -> npt.NDArray[np.int64]:
         """Accessor `index` as unsigned integers [count]."""
@@ -165,6 +188,14 @@ class GltfBuffers:
         out = values.copy()
         out[rows] = fresh
         return out
+
+
+def _scaled(accessor: Accessor, values: Array) -> npt.NDArray[np.float64]:
+    out = values.astype(np.float64)
+    if accessor.component_type == 5126 or not accessor.normalized:
+        return out
+    largest = np.iinfo(np.dtype(DTYPES[accessor.component_type])).max
+    return np.asarray(np.maximum(out / largest, -1.0))
 
 
 def _strided(

@@ -4,6 +4,8 @@ A scene file is a stranger's: validating the document once means that the reader
 malformed field is refused with its path. Unknown fields are ignored, as the specification asks.
 """
 
+import codecs
+import json
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
@@ -20,6 +22,7 @@ Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[float, Field(ge=0.0)]
 Extensions = dict[str, dict[str, Any]]
 T = TypeVar("T")
 Name = Annotated[str, AfterValidator(lambda name: told(name, NAME_LENGTH))]
@@ -43,6 +46,26 @@ class BufferView(_Part):
     byte_offset: Bytes = 0
     byte_length: Bytes
     byte_stride: Annotated[int, Field(ge=4, le=252)] | None = None
+    extensions: Extensions = {}
+
+
+class Meshopt(_Part):
+    """EXT_meshopt_compression of a buffer view."""
+
+    buffer: Index
+    byte_offset: Bytes = 0
+    byte_length: Bytes
+    byte_stride: Annotated[int, Field(ge=2, le=256)]
+    count: Count
+    mode: Literal["ATTRIBUTES", "TRIANGLES", "INDICES"]
+    filter: Literal["NONE", "OCTAHEDRAL", "QUATERNION", "EXPONENTIAL", "COLOR"] = "NONE"
+
+
+class Draco(_Part):
+    """KHR_draco_mesh_compression of a primitive."""
+
+    buffer_view: Index
+    attributes: dict[str, Index]
 
 
 class SparseIndices(_Part):
@@ -77,13 +100,25 @@ class Primitive(_Part):
     indices: Index | None = None
     material: Index | None = None
     mode: Annotated[int, Field(ge=0, le=6)] = 4
-    targets: Table[Any] = []
+    targets: Table[dict[str, Index]] = []
     extensions: Extensions = {}
 
 
 class MeshPart(_Part):
     name: Name = ""
     primitives: Table[Primitive] = []
+    weights: Table[float] = []
+
+
+class Skin(_Part):
+    joints: Table[Index]
+    inverse_bind_matrices: Index | None = None
+
+
+class Visibility(_Part):
+    """KHR_node_visibility."""
+
+    visible: bool = True
 
 
 class Node(_Part):
@@ -91,6 +126,7 @@ class Node(_Part):
     children: Table[Index] = []
     mesh: Index | None = None
     skin: Index | None = None
+    weights: Table[float] = []
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
     translation: Vector3 = (0.0, 0.0, 0.0)
     rotation: Vector4 = (0.0, 0.0, 0.0, 1.0)
@@ -108,6 +144,14 @@ class TextureInfo(_Part):
     extensions: Extensions = {}
 
 
+class NormalInfo(TextureInfo):
+    scale: float = 1.0
+
+
+class OcclusionInfo(TextureInfo):
+    strength: Unit = 1.0
+
+
 class MetallicRoughness(_Part):
     base_color_factor: tuple[Unit, Unit, Unit, Unit] = (1.0, 1.0, 1.0, 1.0)
     base_color_texture: TextureInfo | None = None
@@ -119,7 +163,8 @@ class MetallicRoughness(_Part):
 class MaterialPart(_Part):
     name: Name = ""
     pbr_metallic_roughness: MetallicRoughness = MetallicRoughness()
-    normal_texture: TextureInfo | None = None
+    normal_texture: NormalInfo | None = None
+    occlusion_texture: OcclusionInfo | None = None
     emissive_factor: tuple[Unit, Unit, Unit] = (0.0, 0.0, 0.0)
     emissive_texture: TextureInfo | None = None
     alpha_mode: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
@@ -153,6 +198,43 @@ class EmissiveStrength(_Part):
     emissive_strength: Annotated[float, Field(ge=0.0)] = 1.0
 
 
+class Ior(_Part):
+    ior: Annotated[float, Field(ge=0.0)] = 1.5
+
+
+class Specular(_Part):
+    specular_factor: Unit = 1.0
+    specular_texture: TextureInfo | None = None
+    specular_color_factor: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
+    specular_color_texture: TextureInfo | None = None
+
+
+class Clearcoat(_Part):
+    clearcoat_factor: Unit = 0.0
+    clearcoat_texture: TextureInfo | None = None
+
+
+class Transmission(_Part):
+    transmission_factor: Unit = 0.0
+    transmission_texture: TextureInfo | None = None
+
+
+class SpecularGlossiness(_Part):
+    """KHR_materials_pbrSpecularGlossiness (archived)."""
+
+    diffuse_factor: tuple[Unit, Unit, Unit, Unit] = (1.0, 1.0, 1.0, 1.0)
+    diffuse_texture: TextureInfo | None = None
+    specular_factor: tuple[Unit, Unit, Unit] = (1.0, 1.0, 1.0)
+    glossiness_factor: Unit = 1.0
+    specular_glossiness_texture: TextureInfo | None = None
+
+
+class TextureSource(_Part):
+    """EXT_texture_webp and KHR_texture_basisu."""
+
+    source: Index
+
+
 class TextureTransform(_Part):
     offset: Vector2 = (0.0, 0.0)
     scale: Vector2 = (1.0, 1.0)
@@ -172,11 +254,7 @@ class Spot(_Part):
 class Light(_Part):
     name: Name = ""
     type: Literal["point", "spot", "directional"]
-    color: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = (
-        1,
-        1,
-        1,
-    )
+    color: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
     intensity: Annotated[float, Field(ge=0.0)] = 1.0
     spot: Spot = Spot()
 
@@ -204,6 +282,7 @@ class Document(_Part):
     images: Table[ImagePart] = []
     textures: Table[TexturePart] = []
     samplers: Table[Sampler] = []
+    skins: Table[Skin] = []
     animations: Table[Any] = []
     extensions_used: Table[str] = []
     extensions_required: Table[str] = []
@@ -214,10 +293,14 @@ def parse_document(text: bytes, where: str) -> Document:
     """The document of a file's JSON; InputError names the first field at fault."""
     check_count(len(text), MAX_JSON_BYTES, "bytes of JSON", where, "Save it as GLB.")
     check_count(text.count(b","), MAX_JSON_ITEMS, "commas in its JSON", where)
+    text = text.removeprefix(codecs.BOM_UTF8)
     try:
-        return Document.model_validate_json(text)
+        document = Document.model_validate_json(text)
     except ValidationError as error:
+        _check_version(_told_version(text), where)
         raise _refusal(error, where) from None
+    _check_version(document.asset.version, where)
+    return document
 
 
 def parse_extension(model: type[P], content: dict[str, Any], where: str) -> P:
@@ -233,6 +316,23 @@ def pick(items: list[T], index: int, what: str, where: str) -> T:
     if index >= len(items):
         raise InputError(f"{what} {index} is named but there are {len(items)}", where=where, remedy="Export it again.")
     return items[index]
+
+
+def _check_version(version: str, where: str) -> None:
+    if not version.startswith("2."):
+        raise InputError(
+            f"is glTF {told(version, 20)}",
+            where=where,
+            remedy="Export it as glTF 2.0, or convert it with gltf-pipeline.",
+        )
+
+
+def _told_version(text: bytes) -> str:
+    """What a document that is not valid glTF 2.0 says of its version; 2.0 where it says nothing."""
+    try:
+        return str(json.loads(text)["asset"]["version"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return "2.0"
 
 
 def _refusal(error: ValidationError, where: str) -> InputError:

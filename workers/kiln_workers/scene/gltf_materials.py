@@ -1,13 +1,13 @@
 """Materials, textures and images of a glTF file as the scene model has them; only what a mesh uses is read.
 
-One image may be used as colour (sRGB) and as data (linear); it is then kept twice. The model has one UV set a mesh, so
-where a material's textures use several sets the base colour's wins, with a note. Colours of 16-bit images
-are linearised here, since the model's float images are linear.
+One image may be used as colour (sRGB) and as data (linear); it is then kept twice. The UV sets that a material's
+textures use are numbered in the order of their first use. Colours of 16-bit images are linearised here, since the
+model's float images are linear. Extensions: docs/scene-input.md says what each becomes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 
@@ -15,21 +15,43 @@ from kiln_schemas.errors import InputError
 from kiln_schemas.text import told
 from kiln_workers.scene.gltf_buffers import GltfBuffers
 from kiln_workers.scene.gltf_document import (
+    Clearcoat,
     Document,
     EmissiveStrength,
+    Ior,
     MaterialPart,
+    P,
+    Specular,
+    SpecularGlossiness,
     TextureInfo,
+    TextureSource,
     TextureTransform,
+    Transmission,
     parse_extension,
     pick,
 )
-from kiln_workers.scene.images import LOW_RANGE, decode_image
-from kiln_workers.scene.limits import MAX_IMAGE_BYTES, NAME_LENGTH
-from kiln_workers.scene.model import Float32, Image, Material, TextureRef
+from kiln_workers.scene.images import LOW_RANGE, decode_image, linear_pixels, linearised
+from kiln_workers.scene.limits import MAX_IMAGE_BYTES, MAX_UV_SETS, NAME_LENGTH, check_count
+from kiln_workers.scene.model import Image, Material, TextureRef
 
 WRAP: Final = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 DEFAULT_MATERIAL: Final = MaterialPart(name="default")
-READ_BY_MATERIALS: Final = frozenset({"KHR_materials_emissive_strength", "KHR_materials_unlit"})
+READ_BY_MATERIALS: Final = frozenset(
+    {
+        "KHR_materials_clearcoat",
+        "KHR_materials_emissive_strength",
+        "KHR_materials_ior",
+        "KHR_materials_pbrSpecularGlossiness",
+        "KHR_materials_specular",
+        "KHR_materials_transmission",
+        "KHR_materials_unlit",
+    }
+)
+SOURCES: Final = ("KHR_texture_basisu", "EXT_texture_webp")
+"""Extensions that name a texture's image; they go before its own `source`, which is for readers without them."""
+
+INFINITE_IOR: Final = 1e9
+"""KHR_materials_ior: 0 stands for a reflectance of 1."""
 
 
 @dataclass
@@ -41,84 +63,22 @@ class MaterialTable:
     notes: list[str]
     materials: list[Material] = field(default_factory=list)
     images: list[Image] = field(default_factory=list)
-    _known: dict[int | None, tuple[int, int]] = field(default_factory=dict)
+    _known: dict[int | None, tuple[int, list[int]]] = field(default_factory=dict)
     _image_index: dict[tuple[int, bool], int] = field(default_factory=dict)
 
-    def use(self, index: int | None, mesh: str) -> tuple[int, int]:
-        """Position in `materials` of the document's material `index`, and the TEXCOORD set that it reads."""
+    def use(self, index: int | None, mesh: str) -> tuple[int, list[int]]:
+        """Position in `materials` of the document's material `index`, and the TEXCOORD sets that it reads, in order."""
         if index not in self._known:
             where = f"mesh '{mesh}'"
             part = DEFAULT_MATERIAL if index is None else pick(self.document.materials, index, "material", where)
-            name = part.name or f"material {index}"
-            material, uv_set = self._convert(part, name)
-            self._known[index] = (len(self.materials), uv_set)
+            sets: list[int] = []
+            material = _Conversion(self, part, part.name or f"material {index}", sets).material()
+            self._known[index] = (len(self.materials), sets or [0])
             self.materials.append(material)
         return self._known[index]
 
-    def _convert(self, part: MaterialPart, name: str) -> tuple[Material, int]:
-        pbr = part.pbr_metallic_roughness
-        where = f"material '{name}'"
-        strength = parse_extension(
-            EmissiveStrength, part.extensions.get("KHR_materials_emissive_strength", {}), where
-        ).emissive_strength
-        self._note_ignored(part, name)
-        used = [pbr.base_color_texture, pbr.metallic_roughness_texture, part.emissive_texture]
-        sets = [_uv_set(info, where) for info in used if info is not None]
-        if len(set(sets)) > 1:
-            self.notes.append(
-                f"Material '{name}': its textures use several UV sets; TEXCOORD_{sets[0]} is used for all."
-            )
-        if part.alpha_mode == "BLEND":
-            self.notes.append(f"Material '{name}': blended transparency is baked as a cut-out at alpha 0.5.")
-        cutoff = {"OPAQUE": None, "MASK": part.alpha_cutoff, "BLEND": 0.5}[part.alpha_mode]
-        red, green, blue = (factor * strength for factor in part.emissive_factor)
-        material = Material(
-            name=name,
-            base_color=pbr.base_color_factor,
-            base_color_texture=self._texture(pbr.base_color_texture, True, where),
-            metallic=pbr.metallic_factor,
-            roughness=pbr.roughness_factor,
-            metallic_roughness_texture=self._texture(pbr.metallic_roughness_texture, False, where),
-            emission=(red, green, blue),
-            emission_texture=self._texture(part.emissive_texture, True, where) if max(red, green, blue) > 0 else None,
-            double_sided=part.double_sided,
-            alpha_cutoff=cutoff,
-        )
-        return material, sets[0] if sets else 0
-
-    def _note_ignored(self, part: MaterialPart, name: str) -> None:
-        if part.normal_texture is not None:
-            self.notes.append(f"Material '{name}': its normal map is not baked.")
-        if "KHR_materials_unlit" in part.extensions:
-            self.notes.append(f"Material '{name}': unlit; baked as a lit surface of its base colour.")
-        for extension in sorted(set(part.extensions) - READ_BY_MATERIALS):
-            self.notes.append(f"Material '{name}': {told(extension, NAME_LENGTH)} ignored.")
-
-    def _texture(self, info: TextureInfo | None, srgb: bool, where: str) -> TextureRef | None:
-        if info is None:
-            return None
-        texture = pick(self.document.textures, info.index, "texture", where)
-        if texture.source is None:
-            only = told(", ".join(sorted(texture.extensions)), NAME_LENGTH) or "nothing"
-            raise InputError(
-                f"texture {info.index} has no PNG or JPEG source ({only} instead)",
-                where=where,
-                remedy="Export textures as PNG or JPEG.",
-            )
-        wrap = (10497, 10497)
-        if texture.sampler is not None:
-            sampler = pick(self.document.samplers, texture.sampler, "sampler", where)
-            wrap = (sampler.wrap_s, sampler.wrap_t)
-        transform = parse_extension(TextureTransform, _transform(info), where)
-        return TextureRef(
-            image=self._image(texture.source, srgb, where),
-            wrap=(WRAP[wrap[0]], WRAP[wrap[1]]),
-            offset=transform.offset,
-            scale=transform.scale,
-            rotation=transform.rotation,
-        )
-
-    def _image(self, index: int, srgb: bool, where: str) -> int:
+    def image(self, index: int, srgb: bool, where: str) -> int:
+        """Position in `images` of the document's image `index`, read as colour or as data."""
         key = (index, srgb)
         if key not in self._image_index:
             part = pick(self.document.images, index, "image", where)
@@ -135,6 +95,138 @@ class MaterialTable:
         return self._image_index[key]
 
 
+@dataclass
+class _Conversion:
+    """One material on its way into the model; `sets` collects the TEXCOORD sets that its textures use."""
+
+    table: MaterialTable
+    part: MaterialPart
+    name: str
+    sets: list[int]
+
+    def material(self) -> Material:
+        part, pbr = self.part, self.part.pbr_metallic_roughness
+        self._note_ignored()
+        strength = self._extension(EmissiveStrength, "KHR_materials_emissive_strength").emissive_strength
+        red, green, blue = (factor * strength for factor in part.emissive_factor)
+        out = Material(
+            name=self.name,
+            base_color=pbr.base_color_factor,
+            base_color_texture=self._texture(pbr.base_color_texture, True),
+            metallic=pbr.metallic_factor,
+            roughness=pbr.roughness_factor,
+            metallic_roughness_texture=self._texture(pbr.metallic_roughness_texture, False),
+            emission=(red, green, blue),
+            emission_texture=self._texture(part.emissive_texture, True) if max(red, green, blue) > 0 else None,
+            double_sided=part.double_sided,
+            alpha_cutoff=part.alpha_cutoff if part.alpha_mode == "MASK" else None,
+            blend=part.alpha_mode == "BLEND",
+            ior=self._extension(Ior, "KHR_materials_ior").ior or INFINITE_IOR,
+            normal_texture=self._texture(part.normal_texture, False),
+            normal_scale=1.0 if part.normal_texture is None else part.normal_texture.scale,
+            occlusion_texture=self._texture(part.occlusion_texture, False),
+            occlusion_strength=1.0 if part.occlusion_texture is None else part.occlusion_texture.strength,
+        )
+        return self._with_glossiness(self._with_layers(out))
+
+    def _with_layers(self, material: Material) -> Material:
+        """Transmission, specular and clearcoat; textures of the last two are taken by their mean, with a note."""
+        transmission = self._extension(Transmission, "KHR_materials_transmission")
+        if transmission.transmission_factor > 0.0:
+            material = replace(
+                material,
+                transmission=transmission.transmission_factor,
+                transmission_texture=self._texture(transmission.transmission_texture, False),
+            )
+        specular = self._extension(Specular, "KHR_materials_specular")
+        red, green, blue = self._mean(specular.specular_color_texture, True, "specular colour")[:3]
+        factor = specular.specular_color_factor
+        coat = self._extension(Clearcoat, "KHR_materials_clearcoat")
+        return replace(
+            material,
+            specular=specular.specular_factor * self._mean(specular.specular_texture, False, "specular")[3],
+            specular_color=(factor[0] * red, factor[1] * green, factor[2] * blue),
+            clearcoat=coat.clearcoat_factor * self._mean(coat.clearcoat_texture, False, "clearcoat")[0],
+        )
+
+    def _with_glossiness(self, material: Material) -> Material:
+        """KHR_materials_pbrSpecularGlossiness in the place of metallic-roughness."""
+        if "KHR_materials_pbrSpecularGlossiness" not in self.part.extensions:
+            return material
+        old = self._extension(SpecularGlossiness, "KHR_materials_pbrSpecularGlossiness")
+        mean = self._mean(old.specular_glossiness_texture, True, "specular and glossiness")
+        red, green, blue = (factor * part / 0.04 for factor, part in zip(old.specular_factor, mean[:3], strict=True))
+        return replace(
+            material,
+            base_color=old.diffuse_factor,
+            base_color_texture=self._texture(old.diffuse_texture, True),
+            metallic=0.0,
+            metallic_roughness_texture=None,
+            roughness=1.0 - old.glossiness_factor * mean[3],
+            specular_color=(red, green, blue),
+        )
+
+    def _note_ignored(self) -> None:
+        part, notes = self.part, self.table.notes
+        if "KHR_materials_unlit" in part.extensions:
+            notes.append(f"Material '{self.name}': unlit; baked as a lit surface of its base colour.")
+        for extension in sorted(set(part.extensions) - READ_BY_MATERIALS):
+            notes.append(f"Material '{self.name}': {told(extension, NAME_LENGTH)} ignored.")
+
+    def _extension(self, model: type[P], name: str) -> P:
+        return parse_extension(model, self.part.extensions.get(name, {}), self._where)
+
+    @property
+    def _where(self) -> str:
+        return f"material '{self.name}'"
+
+    def _texture(self, info: TextureInfo | None, srgb: bool) -> TextureRef | None:
+        if info is None:
+            return None
+        document, where = self.table.document, self._where
+        texture = pick(document.textures, info.index, "texture", where)
+        found = next((texture.extensions[name] for name in SOURCES if name in texture.extensions), None)
+        source = texture.source if found is None else parse_extension(TextureSource, found, where).source
+        if source is None:
+            only = told(", ".join(sorted(texture.extensions)), NAME_LENGTH) or "nothing"
+            raise InputError(
+                f"texture {info.index} has no image that is read ({only} instead)",
+                where=where,
+                remedy="Export textures as PNG, JPEG, WebP or KTX2 with Basis Universal.",
+            )
+        wrap = (10497, 10497)
+        if texture.sampler is not None:
+            sampler = pick(document.samplers, texture.sampler, "sampler", where)
+            wrap = (sampler.wrap_s, sampler.wrap_t)
+        transform = parse_extension(TextureTransform, info.extensions.get("KHR_texture_transform", {}), where)
+        return TextureRef(
+            image=self.table.image(source, srgb, where),
+            wrap=(WRAP[wrap[0]], WRAP[wrap[1]]),
+            offset=transform.offset,
+            scale=transform.scale,
+            rotation=transform.rotation,
+            uv_set=self._uv_set(info.tex_coord if transform.tex_coord is None else transform.tex_coord),
+        )
+
+    def _uv_set(self, number: int) -> int:
+        """The place of TEXCOORD_`number` among the sets that the material uses."""
+        if number not in self.sets:
+            check_count(len(self.sets) + 1, MAX_UV_SETS, "UV sets in its textures", self._where)
+            self.sets.append(number)
+        return self.sets.index(number)
+
+    def _mean(self, info: TextureInfo | None, srgb: bool, what: str) -> tuple[float, float, float, float]:
+        """The mean linear RGBA of a texture that stands for all of it; ones where there is none."""
+        sets = list(self.sets)
+        reference = self._texture(info, srgb)
+        self.sets[:] = sets
+        if reference is None:
+            return 1.0, 1.0, 1.0, 1.0
+        self.table.notes.append(f"Material '{self.name}': its {what} texture is replaced by its mean.")
+        red, green, blue, alpha = linear_pixels(self.table.images[reference.image]).mean(axis=(0, 1), dtype=np.float64)
+        return float(red), float(green), float(blue), float(alpha)
+
+
 def make_image(data: bytes, name: str, srgb: bool, where: str, others: Sequence[Image]) -> Image:
     """Decode a texture: 8-bit images stay as stored, all others become linear floats; `others` are there already."""
     decoded = decode_image(data, where, MAX_IMAGE_BYTES - sum(other.pixels.nbytes for other in others))
@@ -145,21 +237,3 @@ def make_image(data: bytes, name: str, srgb: bool, where: str, others: Sequence[
         raise InputError("holds values that are not finite", where=where, remedy="Save it again.")
     encoded = srgb and decoded.format in LOW_RANGE
     return Image(name, linearised(pixels) if encoded else pixels, srgb=False)
-
-
-def linearised(pixels: Float32) -> Float32:
-    """sRGB-encoded [H, W, C] to linear (IEC 61966-2-1); a second or fourth channel is alpha and stays."""
-    colours = pixels.shape[2] - (pixels.shape[2] + 1) % 2
-    out = pixels.copy()
-    part = pixels[..., :colours]
-    out[..., :colours] = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
-    return out
-
-
-def _uv_set(info: TextureInfo, where: str) -> int:
-    override = parse_extension(TextureTransform, _transform(info), where).tex_coord
-    return info.tex_coord if override is None else override
-
-
-def _transform(info: TextureInfo) -> dict[str, Any]:
-    return info.extensions.get("KHR_texture_transform", {})

@@ -18,6 +18,7 @@ import OpenImageIO as oiio
 
 from kiln_schemas.errors import InputError
 from kiln_workers.scene.limits import MAX_IMAGE_BYTES, MAX_PIXELS, MAX_SIDE, check_count
+from kiln_workers.scene.model import Float32, Image
 
 SIGNATURES: Final[Mapping[str, bytes]] = {
     "png": b"\x89PNG\r\n\x1a\n",
@@ -87,3 +88,25 @@ def _read(path: Path, kind: str, where: str, most_bytes: int) -> npt.NDArray[np.
     finally:
         source.close()
     return np.ascontiguousarray(np.asarray(pixels).reshape(spec.height, spec.width, -1))
+
+
+def linear_pixels(image: Image) -> Float32:
+    """The image as linear float32 RGBA [H, W, 4]; grey is spread over RGB, absent alpha is 1."""
+    values = image.pixels.astype(np.float32)
+    if image.pixels.dtype == np.uint8:
+        values /= np.float32(255.0)
+    channels = values.shape[-1]
+    rgb = values[..., :1].repeat(3, axis=-1) if channels <= 2 else values[..., :3]
+    if image.srgb:
+        rgb = linearised(rgb)
+    alpha = values[..., -1:] if channels in (2, 4) else np.ones_like(values[..., :1])
+    return np.concatenate([rgb, alpha], axis=-1).astype(np.float32)
+
+
+def linearised(pixels: Float32) -> Float32:
+    """sRGB-encoded [H, W, C] to linear (IEC 61966-2-1); a second or fourth channel is alpha and stays."""
+    colours = pixels.shape[2] - (pixels.shape[2] + 1) % 2
+    out = pixels.copy()
+    part = pixels[..., :colours]
+    out[..., :colours] = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+    return out

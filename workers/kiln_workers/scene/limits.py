@@ -42,6 +42,8 @@ MAX_IMAGE_BYTES: Final = 4 << 30
 """Of all textures together, decoded."""
 MAX_COORDINATE: Final = 1e7
 """Metres; a float32 tells whole metres apart there."""
+MAX_UV_SETS: Final = 8
+"""Of a mesh that textures use; the light map's comes on top."""
 NAME_LENGTH: Final = 200
 """Characters of a mesh's, material's or image's name that are kept."""
 MAX_COVERAGE: Final = 16.0

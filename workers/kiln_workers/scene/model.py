@@ -5,7 +5,7 @@ packager) reads only this, so no stage knows the input format. Instances are fla
 copy of a mesh becomes its own Mesh because each needs its own part of the light map.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -33,11 +33,16 @@ class TextureRef:
     offset: tuple[float, float] = (0.0, 0.0)
     scale: tuple[float, float] = (1.0, 1.0)
     rotation: float = 0.0  # radians, as KHR_texture_transform
+    uv_set: int = 0  # of `Mesh.uv_sets`
 
 
 @dataclass(frozen=True)
 class Material:
-    """glTF metallic-roughness. `emission` is in radiance (emissiveFactor times emissive strength)."""
+    """glTF metallic-roughness. `emission` is in radiance (emissiveFactor times emissive strength).
+
+    Alpha is base colour's times its texture's and the vertex colour's. It is a test where `alpha_cutoff` is a number,
+    an opacity where `blend` is set, and else plays no part.
+    """
 
     name: str
     base_color: tuple[float, float, float, float] = (0.8, 0.8, 0.8, 1.0)  # linear
@@ -48,7 +53,54 @@ class Material:
     emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
     emission_texture: TextureRef | None = None  # multiplies
     double_sided: bool = False
-    alpha_cutoff: float | None = None  # None: opaque (BLEND is treated as cutoff 0.5, with a note)
+    alpha_cutoff: float | None = None
+    blend: bool = False
+    transmission: float = 0.0  # KHR_materials_transmission: the part of the dielectric's base that lets light through
+    transmission_texture: TextureRef | None = None  # R; multiplies
+    ior: float = 1.5  # KHR_materials_ior
+    specular: float = 1.0  # KHR_materials_specular
+    specular_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    clearcoat: float = 0.0  # KHR_materials_clearcoat
+    normal_texture: TextureRef | None = None
+    normal_scale: float = 1.0
+    occlusion_texture: TextureRef | None = None  # for viewers alone: the bake has true occlusion
+    occlusion_strength: float = 1.0
+
+    @property
+    def textures(self) -> tuple[TextureRef, ...]:
+        """All look-ups of the material."""
+        references = (
+            self.base_color_texture,
+            self.metallic_roughness_texture,
+            self.emission_texture,
+            self.transmission_texture,
+            self.normal_texture,
+            self.occlusion_texture,
+        )
+        return tuple(reference for reference in references if reference is not None)
+
+    @property
+    def lets_light_pass(self) -> bool:
+        """Whether light may go straight through: an alpha test, an opacity or transmission."""
+        return self.alpha_cutoff is not None or self.is_veil
+
+    @property
+    def is_veil(self) -> bool:
+        """Whether it may let a part of the light pass, not all or nothing."""
+        return self.blend or self.transmission > 0.0
+
+    @property
+    def dielectric_f0(self) -> tuple[float, float, float]:
+        """Reflectance of the dielectric at normal incidence (KHR_materials_ior, _specular); a coat's 0.04 is added."""
+        ratio = ((self.ior - 1.0) / (self.ior + 1.0)) ** 2
+        coat = 0.04 * self.clearcoat
+        red, green, blue = (min(ratio * colour, 1.0) * self.specular for colour in self.specular_color)
+        return red + (1.0 - red) * coat, green + (1.0 - green) * coat, blue + (1.0 - blue) * coat
+
+    @property
+    def dielectric_f90(self) -> float:
+        """Reflectance of the dielectric at grazing incidence; a coat's is 1."""
+        return self.specular + (1.0 - self.specular) * self.clearcoat
 
 
 @dataclass(frozen=True)
@@ -60,8 +112,38 @@ class Mesh:
     normals: Float32  # [V, 3] unit shading normals
     faces: Int32  # [F, 3]
     material: int
-    uv: Float32 | None = None  # [V, 2] TEXCOORD_0, v downwards
+    uv: Float32 | None = None  # [V, 2] the first set that textures use, v downwards
     lightmap_uv: Float32 | None = None  # [V, 2] in the light-map atlas, v downwards
+    more_uv: tuple[Float32, ...] = ()  # [V, 2] each: the sets after `uv`
+    colors: Float32 | None = None  # [V, 4] linear RGBA, multiplies the base colour
+
+    @property
+    def uv_sets(self) -> tuple[Float32, ...]:
+        """The sets that `TextureRef.uv_set` counts."""
+        return () if self.uv is None else (self.uv, *self.more_uv)
+
+    def uv_of(self, reference: TextureRef | None) -> Float32 | None:
+        """The coordinates [V, 2] of a look-up; None where there is no look-up or the mesh lacks the set."""
+        if reference is None or reference.uv_set >= len(self.uv_sets):
+            return None
+        return self.uv_sets[reference.uv_set]
+
+    def with_vertices(self, vertices: npt.NDArray[np.integer], faces: Int32) -> "Mesh":
+        """The mesh with `vertices` [V'] picked from its own, and `faces` that count them."""
+
+        def picked(values: Float32 | None) -> Float32 | None:
+            return None if values is None else values[vertices]
+
+        return replace(
+            self,
+            positions=self.positions[vertices],
+            normals=self.normals[vertices],
+            faces=faces,
+            uv=picked(self.uv),
+            lightmap_uv=picked(self.lightmap_uv),
+            more_uv=tuple(values[vertices] for values in self.more_uv),
+            colors=picked(self.colors),
+        )
 
 
 class LightKind(StrEnum):

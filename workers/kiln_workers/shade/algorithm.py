@@ -80,6 +80,15 @@ class Surface:
     base_color: Tensor  # [P, 3]
     metallic: Tensor  # [P]
     alpha: Tensor  # [P] GGX width
+    dielectric: Tensor | None = None  # [P, 4] F0 of the dielectric, and its F90; 0.04 and 1
+    transmission: Tensor | None = None  # [P] the part of the dielectric's base that lets light through; 0
+
+    @property
+    def ends(self) -> Tensor:
+        """F0 of the dielectric, and its F90 [P, 4]."""
+        if self.dielectric is not None:
+            return self.dielectric
+        return self.alpha.new_tensor([DIELECTRIC_F0] * 3 + [1.0]).expand(len(self.alpha), 4)
 
     @property
     def cosine(self) -> Tensor:
@@ -139,13 +148,13 @@ def reflection_kernels(surface: Surface) -> tuple[Kernel, Kernel]:
 
 
 def dielectric_share(surface: Surface) -> Tensor:
-    """What a surface's largest F0 reflects as a dielectric of 0.04 would [P]: (1 - F0) / 0.96 of it, over the whole.
+    """What a surface's largest F0 reflects as a dielectric of 0.04 would [P], over the whole.
 
-    F0 + (1 - F0) u = p + q (0.04 + 0.96 u) with q = (1 - F0) / 0.96, u = (1 - o.h)^5.
+    F0 + (F90 - F0) u = p + q (0.04 + 0.96 u) with q = (F90 - F0) / 0.96, u = (1 - o.h)^5.
     """
-    f0 = specular_f0(surface).amax(dim=-1)
+    f0, f90 = specular_f0(surface).amax(dim=-1), specular_f90(surface)[:, 0]
     a, b = albedo_terms(surface)
-    share = (1.0 - f0) / (1.0 - DIELECTRIC_F0) * (DIELECTRIC_F0 * a + b) / (f0 * a + b).clamp(min=1e-6)
+    share = (f90 - f0) / (1.0 - DIELECTRIC_F0) * (DIELECTRIC_F0 * a + b) / (f0 * a + f90 * b).clamp(min=1e-6)
     return share.clamp(0.0, 1.0)
 
 
@@ -254,8 +263,15 @@ def fresnel(f0: Tensor | float, cosine: Tensor) -> Tensor:
 
 
 def specular_f0(surface: Surface) -> Tensor:
-    """Reflectance at normal incidence [P, 3]: 0.04, or a metal's base colour."""
-    return DIELECTRIC_F0 + (surface.base_color - DIELECTRIC_F0) * surface.metallic[:, None]
+    """Reflectance at normal incidence [P, 3]: the dielectric's, or a metal's base colour."""
+    dielectric = surface.ends[:, :3]
+    return dielectric + (surface.base_color - dielectric) * surface.metallic[:, None]
+
+
+def specular_f90(surface: Surface) -> Tensor:
+    """Reflectance at grazing incidence [P, 1]: the dielectric's, or 1."""
+    dielectric = surface.ends[:, 3:]
+    return dielectric + (1.0 - dielectric) * surface.metallic[:, None]
 
 
 def reflectance(surface: Surface) -> Tensor:
@@ -266,7 +282,7 @@ def reflectance(surface: Surface) -> Tensor:
     alpha 0.04 to 1 and o.n from 0.02 (2 % at most against quadrature, rms 1 %).
     """
     a, b = albedo_terms(surface)
-    return specular_f0(surface) * a[:, None] + b[:, None]
+    return specular_f0(surface) * a[:, None] + specular_f90(surface) * b[:, None]
 
 
 def albedo_terms(surface: Surface) -> tuple[Tensor, Tensor]:
@@ -295,12 +311,20 @@ def paper_factor(surface: Surface) -> Tensor:
     return fresnel(specular_f0(surface), cosine) * (masking / (4.0 * cosine))[:, None]
 
 
-def transmission(cosine: Tensor) -> Tensor:
-    """T [P]: mean over the cosine-weighted hemisphere of 1 - F(o.h) for F0 = 0.04, fitted within 0.001."""
-    return DIFFUSE_FIT[0] - DIFFUSE_FIT[1] * (1.0 - cosine) ** 3
+def transmission(cosine: Tensor, f0: Tensor | float = DIELECTRIC_F0, f90: Tensor | float = 1.0) -> Tensor:
+    """T [P]: mean over the cosine-weighted hemisphere of 1 - F(o.h), fitted within 0.001 for F0 = 0.04.
+
+    It is 1 - F0 - (F90 - F0) m with m the mean of (1 - o.h)^5, which the fit tells.
+    """
+    fitted = DIFFUSE_FIT[0] - DIFFUSE_FIT[1] * (1.0 - cosine) ** 3
+    mean = (1.0 - DIELECTRIC_F0 - fitted) / (1.0 - DIELECTRIC_F0)
+    return 1.0 - f0 - (f90 - f0) * mean
 
 
 def diffuse(surface: Surface, irradiance: Tensor) -> Tensor:
     """Diffusely reflected radiance [P, 3] of an irradiance [P, 3], less what the specular layer reflects."""
-    share = (1.0 - surface.metallic) * transmission(surface.cosine) / pi
+    f0, f90 = surface.ends[:, :3].max(dim=-1).values, surface.ends[:, 3]
+    share = (1.0 - surface.metallic) * transmission(surface.cosine, f0, f90) / pi
+    if surface.transmission is not None:
+        share = share * (1.0 - surface.transmission)
     return irradiance * surface.base_color * share[:, None]

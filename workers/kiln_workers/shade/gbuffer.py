@@ -4,7 +4,8 @@ Mitsuba says which triangle a ray meets and where; attributes are interpolated h
 the light-map coordinates are those of the package's `scene.glb` and nothing has passed through the renderer's UVs.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,9 @@ Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
 
+MAX_LAYERS: Final = 16
+"""Surfaces behind each other that let a part of the light pass; what is behind the last is not seen."""
+
 
 @dataclass(frozen=True)
 class GBuffer:
@@ -41,6 +45,11 @@ class GBuffer:
     emission: Float32  # [P, 3] radiance towards the eye
     reflects: Bools  # [P] False on the back of a single-sided surface, which is black
     specular_escapes: Bools  # [P] whether the ray in the specular direction leaves the scene
+    dielectric: Float32  # [P, 4] F0 of the dielectric, and its F90
+    opacity: Float32  # [P] how much of the surface is there
+    transmission: Float32  # [P] the part of the dielectric's base that lets light through
+    through: Float32  # [P, 3] the part of the light from behind that the eye sees
+    behind: "GBuffer | None" = None  # what is seen through the points of which `through` is not 0
 
     def __len__(self) -> int:
         return len(self.position)
@@ -61,19 +70,38 @@ def render_gbuffer(
     select_variant(device)
     camera = local_camera(camera, scene.origin)
     directions = pixel_directions(camera, width, height, grid).astype(np.float32)
-    flat = directions.reshape(-1, 3)
     tracer = PathTracer(scene, max_depth=0)
-    ray = mi.Ray3f(mi.Point3f(*camera.position), mi.Vector3f(np.ascontiguousarray(flat.T)))
-    si = tracer.closest(ray, mi.Bool(True))
-    dr.eval(si)
-    hit = np.array(si.is_valid()).astype(bool)
+    count = directions[..., 0].size
+    origins = np.broadcast_to(np.asarray(camera.position, np.float32), (count, 3))
+    return _layer(scene, tracer, directions, origins, np.ones(count, np.bool_), MAX_LAYERS)
+
+
+def _layer(
+    scene: Scene, tracer: PathTracer, directions: Float32, origins: Float32, active: Bools, layers: int
+) -> GBuffer:
+    """What the rays from `origins` [R, 3] meet first, and behind that, where it lets light pass, `layers` - 1 more."""
+    flat = directions.reshape(-1, 3)
+    point, towards = (np.ascontiguousarray(values.T.astype(np.float32)) for values in (origins, flat))
+    ray = mi.Ray3f(mi.Point3f(point), mi.Vector3f(towards))
+    # All that holds back any light is a surface here.
+    si, _ = tracer.scattering(ray, mi.Float(1.0 - 1e-6), mi.Bool(active))
+    onwards = tracer.beyond(si, ray.d)
+    dr.eval(si, onwards)
+    hit = np.array(si.is_valid()).astype(bool) & active
     shapes = tracer.scene.shapes()
     identifiers = np.array([int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes])
     table = np.zeros(identifiers.max() + 1, np.int64)
     table[identifiers] = [mesh_number(shape) for shape in shapes]
     mesh = table[np.array(dr.reinterpret_array(mi.UInt32, si.shape))[hit]]
     surface = _interpolated(scene, mesh, np.array(si.prim_index)[hit].astype(np.int64), np.array(si.p).T[hit])
-    return _gbuffer(scene, directions, hit, mesh, surface, tracer)
+    buffer = _gbuffer(scene, directions, hit, mesh, surface, tracer)
+    passes = buffer.through.max(axis=1, initial=0.0) > 0.0
+    if layers <= 1 or not passes.any():
+        return buffer
+    further = np.zeros_like(hit)
+    further[hit] = passes
+    behind = _layer(scene, tracer, directions, np.array(onwards).T, further, layers - 1)
+    return replace(buffer, behind=behind)
 
 
 @dataclass(frozen=True)
@@ -83,16 +111,19 @@ class _Vertices:
     position: Floats  # [P, 3]
     normal: Floats  # [P, 3] interpolated, unit
     face_normal: Floats  # [P, 3] unit
-    uv: Floats  # [P, 2]
     lightmap_uv: Floats  # [P, 2]
     clearance: Floats  # [P] metres
+    tint: Floats  # [P, 4] vertex colours, 1 where there are none
+    uv: Floats  # [P, sets, 2] 0 where a mesh lacks a set
 
 
 def _interpolated(scene: Scene, mesh: Ints, face: Ints, position: Float32) -> _Vertices:
     """Attributes at points [P, 3] that lie on triangles `face` [P] of meshes `mesh` [P]."""
     count = len(mesh)
-    normal, face_normal, uv, lightmap_uv = (np.zeros((count, size)) for size in (3, 3, 2, 2))
-    out = _Vertices(position.astype(np.float64), normal, face_normal, uv, lightmap_uv, np.zeros(count))
+    sets = max((len(one.uv_sets) for one in scene.meshes), default=0)
+    normal, face_normal, lightmap_uv = (np.zeros((count, size)) for size in (3, 3, 2))
+    tint, uv = np.ones((count, 4)), np.zeros((count, sets, 2))
+    out = _Vertices(position.astype(np.float64), normal, face_normal, lightmap_uv, np.zeros(count), tint, uv)
     for number in np.unique(mesh):
         at = mesh == number
         one = scene.meshes[number]
@@ -101,7 +132,8 @@ def _interpolated(scene: Scene, mesh: Ints, face: Ints, position: Float32) -> _V
         weights, out.face_normal[at] = barycentric(one, corners, out.position[at])
         mean = np.einsum("pk,pkc->pc", weights, one.normals[corners].astype(np.float64))
         out.normal[at] = mean / np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), 1e-30)
-        for target, values in ((out.uv, one.uv), (out.lightmap_uv, one.lightmap_uv)):
+        coordinates = [(out.uv[:, number], values) for number, values in enumerate(one.uv_sets)]
+        for target, values in (*coordinates, (out.lightmap_uv, one.lightmap_uv), (out.tint, one.colors)):
             if values is not None:
                 target[at] = np.einsum("pk,pkc->pc", weights, values[corners].astype(np.float64))
     return out
@@ -125,7 +157,7 @@ def _gbuffer(
 ) -> GBuffer:
     """Materials added, normals turned to the eye, the specular direction followed."""
     materials = np.array([one.material for one in scene.meshes], np.int64)[mesh]
-    reflectance = material.evaluate(scene, materials, surface.uv)
+    reflectance = material.evaluate(scene, materials, surface.uv, surface.tint)
     view = -directions.reshape(-1, 3)[hit]
     front = np.einsum("pc,pc->p", surface.face_normal, view) > 0.0
     seen = front | reflectance.double_sided
@@ -134,6 +166,11 @@ def _gbuffer(
     # Where the interpolated normal faces away from the eye the geometric one is taken, as the path tracer does.
     away = np.einsum("pc,pc->p", normal, view) <= 0.0
     normal[away] = face_normal[away]
+    # As `kiln_gltf.eval_null_transmission`.
+    f0, f90 = reflectance.dielectric[:, :3].max(axis=1), reflectance.dielectric[:, 3]
+    cosine = np.clip(np.abs(np.einsum("pc,pc->p", normal, view)), 0.0, 1.0)
+    kept = reflectance.transmission * (1.0 - reflectance.metallic) * (1.0 - f0 - (f90 - f0) * (1.0 - cosine) ** 5)
+    opacity = reflectance.opacity[:, None]
     return GBuffer(
         directions=directions,
         hit=hit.reshape(directions.shape[:3]),
@@ -147,6 +184,10 @@ def _gbuffer(
         emission=np.where(seen[:, None], reflectance.emission, 0.0).astype(np.float32),
         reflects=seen,
         specular_escapes=_escapes(tracer, surface.position, surface.clearance, face_normal, normal, view),
+        dielectric=reflectance.dielectric,
+        opacity=reflectance.opacity,
+        transmission=reflectance.transmission,
+        through=(1.0 - opacity + opacity * kept[:, None] * reflectance.base_color).astype(np.float32),
     )
 
 

@@ -29,6 +29,15 @@ def shade(
     `paper`: D, F and G as the paper has them, instead of fitted kernels and the albedo of GGX.
     """
     height, width, samples = buffer.hit.shape
+    out = _shade_samples(package, buffer, terms, incident, paper)
+    return np.asarray(out.reshape(height, width, samples, 3).mean(axis=2), np.float32)
+
+
+def _shade_samples(
+    package: ShadePackage, buffer: GBuffer, terms: Collection[Term], incident: Incident | None, paper: bool
+) -> Float32:
+    """Radiance [H * W * S, 3] of a G-buffer's samples, with what is seen through its surfaces."""
+    height, width, samples = buffer.hit.shape
     out = np.zeros((height * width * samples, 3), np.float32)
     hit = buffer.hit.ravel()
     surfaces = np.zeros((len(buffer), 3), np.float32)
@@ -41,7 +50,9 @@ def shade(
     if Term.BACKGROUND in terms and package.environment is not None and not hit.all():
         directions = _tensor(buffer.directions.reshape(-1, 3)[~hit], package.irradiance)
         out[~hit] = package.environment.seen(directions).cpu().numpy()
-    return np.asarray(out.reshape(height, width, samples, 3).mean(axis=2), np.float32)
+    if buffer.behind is not None:
+        out[hit] += buffer.through * _shade_samples(package, buffer.behind, terms, incident, paper)[hit]
+    return out
 
 
 def _shade_points(
@@ -56,6 +67,8 @@ def _shade_points(
         base_color=_tensor(buffer.base_color[part], like),
         metallic=_tensor(buffer.metallic[part], like),
         alpha=_tensor(buffer.alpha[part], like),
+        dielectric=_tensor(buffer.dielectric[part], like),
+        transmission=_tensor(buffer.transmission[part], like),
     )
     factor = algorithm.paper_factor(surface) if paper else algorithm.reflectance(surface)
     radiance = torch.zeros_like(surface.normal)
@@ -76,6 +89,7 @@ def _shade_points(
     radiance *= _tensor(buffer.reflects[part].astype(np.float32), like)[:, None]
     if Term.EMISSION in terms:
         radiance += _tensor(buffer.emission[part], like)
+    radiance *= _tensor(buffer.opacity[part], like)[:, None]
     return np.asarray(radiance.cpu().numpy(), np.float32)
 
 
