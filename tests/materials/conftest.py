@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from kiln_schemas.settings import RenderSettings
+from kiln_workers.package import png
 from kiln_workers.render.backend import select_variant
 from kiln_workers.render.tile import TexelBatch, TileRenderer
 from kiln_workers.scene.load import load_scene
@@ -60,3 +61,13 @@ def irradiance_in() -> Irradiance:
         return irradiance_of(load_scene(DATA, name), points, **more)  # type: ignore[arg-type]
 
     return measure
+
+
+@pytest.fixture
+def write_png() -> Callable[[Path, np.ndarray], None]:
+    """Write [H, W, C] bytes as PNG."""
+
+    def write(path: Path, pixels: np.ndarray) -> None:
+        path.write_bytes(png.encode(pixels))
+
+    return write

@@ -104,8 +104,8 @@ def linear_pixels(image: Image) -> Float32:
 
 
 def linearised(pixels: Float32) -> Float32:
-    """sRGB-encoded [H, W, C] to linear (IEC 61966-2-1); a second or fourth channel is alpha and stays."""
-    colours = pixels.shape[2] - (pixels.shape[2] + 1) % 2
+    """sRGB-encoded [..., C] to linear (IEC 61966-2-1); a second or fourth channel is alpha and stays."""
+    colours = pixels.shape[-1] - (pixels.shape[-1] + 1) % 2
     out = pixels.copy()
     part = pixels[..., :colours]
     out[..., :colours] = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
