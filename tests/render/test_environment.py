@@ -24,12 +24,12 @@ def only(environment: Environment, quad: Callable[..., Mesh]) -> Scene:
 
 @pytest.mark.parametrize("rotation", [0.0, 90.0, -35.0])
 def test_pixels_lie_where_the_model_says(rotation: float) -> None:
-    """`scene.model.Environment`: (sin t sin p, cos t, -sin t cos p), turned counter-clockwise seen from above."""
+    """`scene.model.Environment`: (-sin t cos p, cos t, -sin t sin p), turned counter-clockwise seen from above."""
     pixels = np.random.default_rng(5).random((4, 8, 3)).astype(np.float32)
     environment = Environment(pixels, scale=2.0, rotation_deg=rotation)
     for row, column in ((0, 0), (1, 3), (3, 7)):
         theta, phi = np.pi * (row + 0.5) / 4, 2.0 * np.pi * (column + 0.5) / 8
-        d = np.array([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)])
+        d = np.array([-np.sin(theta) * np.cos(phi), np.cos(theta), -np.sin(theta) * np.sin(phi)])
         turn = np.radians(rotation)
         # Counter-clockwise seen from +Y takes +Z to +X.
         d = np.array([np.cos(turn) * d[0] + np.sin(turn) * d[2], d[1], -np.sin(turn) * d[0] + np.cos(turn) * d[2]])

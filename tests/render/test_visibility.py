@@ -87,8 +87,8 @@ def test_a_sun_of_one_pixel_is_not_missed(
     """The sun 23 degrees high holds nearly all the energy: W_E is close to its own visibility, 1 or 0."""
     pixels = np.full((32, 64, 3), 1e-3, np.float32)
     pixels[11, column] = 1e4
-    # Column 16 is at +X; turned by 180 degrees it is at -X, away from the wall.
-    scene = with_environment(wall(quad), Environment(pixels, rotation_deg=180.0))
+    # Column 16 is at -Z; turned by 90 degrees it is at -X, away from the wall.
+    scene = with_environment(wall(quad), Environment(pixels, rotation_deg=90.0))
     image = renderer(scene, samples=1, irradiance_samples=1).render(texels([(0, 0, 0)])).visibility
     assert image is not None
     # The lobes whose hemisphere holds the sun.

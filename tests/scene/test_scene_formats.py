@@ -187,7 +187,7 @@ def test_mitsuba_lights_and_environment(tmp_path, write_image):
     <emitter type="directional"><vector name="direction" x="0" y="-2" z="0"/></emitter>"""
     scene = load_scene(tmp_path, xml(tmp_path, body))
     assert scene.environment.scale == 2.0
-    np.testing.assert_allclose(scene.environment.rotation_deg, 35.0)
+    np.testing.assert_allclose(scene.environment.rotation_deg, 35.0 - 90.0)
     point, spot, sun = scene.lights
     assert [light.kind for light in scene.lights] == [LightKind.POINT, LightKind.SPOT, LightKind.DIRECTIONAL]
     assert point.position == (1.0, 2.0, 3.0) and point.intensity == (4.0, 4.0, 4.0)

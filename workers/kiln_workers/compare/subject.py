@@ -20,9 +20,9 @@ from kiln_schemas.conventions import MANIFEST_JSON, SCENE_GLB
 from kiln_schemas.errors import InputError, NotFound
 from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import BakeSettings, Function
-from kiln_workers.scene.environment import read_environment
+from kiln_workers.scene.environment import place_environment, read_environment
 from kiln_workers.scene.gltf import read_gltf
-from kiln_workers.scene.model import Environment, Scene
+from kiln_workers.scene.model import Scene
 from kiln_workers.scene.origin import about_own_centre
 from kiln_workers.shade.package import read_manifest
 from kiln_workers.store.light_field import LightFieldStore
@@ -150,7 +150,9 @@ def _with_environment(scene: Scene, folder: Path, manifest: Manifest, env: Path 
         data = path.read_bytes() if path.is_file() else b""
         if hashlib.sha256(data).hexdigest() == digest:
             pixels, _ = read_environment(data, str(path))
-            return replace(scene, environment=Environment(pixels, wanted.scale, wanted.rotation_deg))
+            # The manifest does not name the entry; XML places environments in its own way.
+            entry = next((name for name in manifest.inputs if name.endswith(".xml")), SCENE_GLB)
+            return replace(scene, environment=place_environment(pixels, wanted.scale, wanted.rotation_deg, entry))
     if env is not None:
         raise InputError(f"is not the environment of this bake ({wanted.file})", where=str(env))
     raise NotFound(

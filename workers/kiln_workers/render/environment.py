@@ -137,7 +137,7 @@ def look_up(environment: Environment, directions: Floats) -> Floats:
     turn = np.radians(environment.rotation_deg)
     x = np.cos(turn) * directions[..., 0] - np.sin(turn) * directions[..., 2]
     z = np.sin(turn) * directions[..., 0] + np.cos(turn) * directions[..., 2]
-    theta, phi = np.arccos(np.clip(directions[..., 1], -1.0, 1.0)), np.arctan2(x, -z)
+    theta, phi = np.arccos(np.clip(directions[..., 1], -1.0, 1.0)), np.arctan2(-z, -x)
     row, column = theta / np.pi * height - 0.5, phi / (2.0 * np.pi) * width - 0.5
     top, left = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
     down, right = (row - top)[..., None], (column - left)[..., None]
@@ -148,15 +148,11 @@ def look_up(environment: Environment, directions: Floats) -> Floats:
 
 
 def panorama(environment: Environment, widest: int) -> Float32:
-    """The scaled environment [H, W, 3] as three.js and Blender look it up, averaged down to `widest` columns.
-
-    Row 0 is +Y, the centre is +X; to the right of it lies +Z, to the left -Z, both ends are -X.
-    """
+    """The scaled environment [H, W, 3] with its rotation applied to the pixels, averaged down to `widest` columns."""
     pixels = environment.pixels
     if pixels.shape[1] > widest:
         pixels = averaged_down(pixels, widest)
-    # The model's centre column is +Z with -X to its right: a quarter turn, and the environment's own rotation.
-    shift = pixels.shape[1] * (environment.rotation_deg / 360.0 - 0.25)
+    shift = pixels.shape[1] * environment.rotation_deg / 360.0
     whole = int(np.floor(shift))
     near = np.roll(pixels.astype(np.float64), -whole, axis=1)
     turned = near + (shift - whole) * (np.roll(near, -1, axis=1) - near)
@@ -208,7 +204,7 @@ def _direction(theta: Floats, phi: Floats, rotation: float) -> Floats:
     """World directions [K, 3] of angles in the image (`scene.model.Environment`), turned about +Y."""
     # Turning by `rotation` about +Y, counter-clockwise from above, is a shift of phi.
     turned = phi - rotation
-    return np.stack([np.sin(theta) * np.sin(turned), np.cos(theta), -np.sin(theta) * np.cos(turned)], axis=-1)
+    return np.stack([-np.sin(theta) * np.cos(turned), np.cos(theta), -np.sin(theta) * np.sin(turned)], axis=-1)
 
 
 def _halved(pixels: Floats) -> Floats:

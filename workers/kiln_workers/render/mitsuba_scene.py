@@ -14,6 +14,7 @@ import numpy as np
 from kiln_workers.render.backend import select_variant, watertight
 from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.materials import MaterialBuilder, vertex_attributes
+from kiln_workers.scene.environment import MITSUBA_TURN
 from kiln_workers.scene.geometry import Floats
 from kiln_workers.scene.model import Environment, Float32, LightKind, Mesh, PunctualLight, Scene
 from kiln_workers.scene.precision import face_clearance
@@ -173,7 +174,7 @@ def _light(light: PunctualLight, weight: float) -> dict[str, Any]:
 
 
 def _environment(environment: Environment, weight: float) -> dict[str, Any]:
-    turn = mi.ScalarTransform4f().rotate([0.0, 1.0, 0.0], environment.rotation_deg)
+    turn = mi.ScalarTransform4f().rotate([0.0, 1.0, 0.0], environment.rotation_deg - MITSUBA_TURN)
     return {
         "type": "envmap",
         "bitmap": mi.Bitmap(doubled_rows(environment.pixels)),

@@ -5,7 +5,8 @@ everywhere without a word. Images wider than 4096 pixels are averaged down by bo
 solid angles, so the light that arrives stays the same.
 """
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Final
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -18,13 +19,21 @@ from kiln_workers.scene.images import HDR_FORMATS, decode_image, image_format
 from kiln_workers.scene.model import Environment, Float32
 
 MAX_WIDTH = 4096
+MITSUBA_TURN: Final = -90.0
+"""Degrees that turn an image from where `model.Environment` has it to where Mitsuba's `envmap` has it."""
 
 
-def load_environment(folder: Path, reference: EnvironmentRef) -> tuple[Environment, list[str]]:
-    """The environment that `reference` names inside `folder`, and notes."""
+def load_environment(folder: Path, reference: EnvironmentRef, entry: str = "") -> tuple[Environment, list[str]]:
+    """The environment that `reference` names inside `folder` around the scene `entry`, and notes."""
     data = BundleFolder(folder, "environment").read(reference.file, "environment")
     pixels, notes = read_environment(data, reference.file)
-    return Environment(pixels, reference.scale, reference.rotation_deg), notes
+    return place_environment(pixels, reference.scale, reference.rotation_deg, entry), notes
+
+
+def place_environment(pixels: Float32, scale: float, rotation_deg: float, entry: str) -> Environment:
+    """An image around the scene `entry`, as programs of its format place one: Mitsuba for XML, else three.js."""
+    turn = MITSUBA_TURN if PurePosixPath(entry).suffix.lower() == ".xml" else 0.0
+    return Environment(pixels, scale, rotation_deg + turn)
 
 
 def read_environment(data: bytes, name: str) -> tuple[Float32, list[str]]:

@@ -47,7 +47,7 @@ def _read(reader: Callable[[Path, str], Scene], folder: Path, entry: str, enviro
         raise InputError("has no faces", where=entry, remedy="Export at least one mesh with triangles of some area.")
     if environment is None:
         return scene
-    loaded, notes = load_environment(folder, environment)
+    loaded, notes = load_environment(folder, environment, entry)
     if scene.environment is not None:
         notes = [f"'{entry}': its own environment is replaced by '{environment.file}'.", *notes]
     return replace(scene, environment=loaded, notes=(*scene.notes, *notes))

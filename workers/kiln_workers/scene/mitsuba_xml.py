@@ -14,7 +14,7 @@ import numpy as np
 from kiln_schemas.errors import InputError
 from kiln_schemas.text import quoted
 from kiln_workers.scene.bundle import BundleFolder
-from kiln_workers.scene.environment import read_environment
+from kiln_workers.scene.environment import MITSUBA_TURN, read_environment
 from kiln_workers.scene.geometry import check_mesh_count, check_triangle_count, place, unique_names
 from kiln_workers.scene.limits import MAX_TEXT_BYTES, check_count
 from kiln_workers.scene.mitsuba_plugins import shape_meshes, surface_material
@@ -157,7 +157,8 @@ class _Reader:
             np.hypot(turn[0, 0], turn[0, 2]), 1.0, atol=1e-5
         ):
             raise plugin.fail("its to_world is no rotation about +Y", "Turn the image itself.")
-        return Environment(pixels, plugin.number("scale", 1.0), float(np.rad2deg(np.arctan2(turn[0, 2], turn[0, 0]))))
+        rotation = float(np.rad2deg(np.arctan2(turn[0, 2], turn[0, 0])))
+        return Environment(pixels, plugin.number("scale", 1.0), rotation + MITSUBA_TURN)
 
 
 def _light(plugin: Plugin) -> PunctualLight:

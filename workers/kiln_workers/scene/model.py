@@ -170,8 +170,9 @@ class Environment:
     """Distant illumination, equirectangular. Row 0 is +Y.
 
     With u = (column + 1/2)/W, v = (row + 1/2)/H, theta = pi v (from +Y), phi = 2 pi u: before rotation the
-    direction is (sin theta sin phi, cos theta, -sin theta cos phi), so the image's centre column looks at +Z, as
-    Mitsuba's `envmap` has it. `rotation_deg` turns the image about +Y, counter-clockwise seen from above.
+    direction is (-sin theta cos phi, cos theta, -sin theta sin phi), so the image's centre column looks at +X and what
+    is to the right of it at +Z, as three.js (`equirectUv`), Blender and viewers of glTF have it. Mitsuba's `envmap`
+    stands a quarter turn away. `rotation_deg` turns the image about +Y, counter-clockwise seen from above.
     """
 
     pixels: Float32  # [H, W, 3] linear radiance, scale NOT applied

@@ -70,7 +70,7 @@ def equirectangular_directions(width: int) -> Floats:
     height = width // 2
     theta = np.pi * (np.arange(height)[:, None] + 0.5) / height
     phi = 2.0 * np.pi * (np.arange(width)[None, :] + 0.5) / width
-    x, z = np.sin(theta) * np.sin(phi), -np.sin(theta) * np.cos(phi)
+    x, z = -np.sin(theta) * np.cos(phi), -np.sin(theta) * np.sin(phi)
     return np.stack([x, np.broadcast_to(np.cos(theta), x.shape), z], axis=-1)
 
 

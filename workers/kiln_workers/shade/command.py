@@ -15,9 +15,9 @@ from kiln_schemas.errors import InputError
 from kiln_schemas.files import open_regular
 from kiln_workers.package import colour
 from kiln_workers.render.backend import select_variant
-from kiln_workers.scene.environment import read_environment
+from kiln_workers.scene.environment import place_environment, read_environment
 from kiln_workers.scene.load import check_light, load_scene
-from kiln_workers.scene.model import Environment, Scene
+from kiln_workers.scene.model import Scene
 from kiln_workers.scene.sheets import part_sheets
 from kiln_workers.shade.gbuffer import render_gbuffer
 from kiln_workers.shade.image_files import check_output, write_picture
@@ -111,7 +111,7 @@ def read_scene(path: Path, env: Path | None, scale: float, rotation_deg: float) 
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(env)) from None
     pixels, _ = read_environment(data, str(env))
-    return replace(scene, environment=Environment(pixels, scale, rotation_deg))
+    return replace(scene, environment=place_environment(pixels, scale, rotation_deg, path.name))
 
 
 def parse_size(text: str) -> tuple[int, int]:
