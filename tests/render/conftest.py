@@ -96,4 +96,4 @@ def sky() -> Environment:
     rows, columns = np.mgrid[0:24, 0:48]
     pixels = np.stack([0.2 + 0.02 * rows, 0.3 + 0.01 * columns, 0.9 - 0.02 * rows], axis=-1).astype(np.float32)
     pixels[5, 9] = (120.0, 110.0, 90.0)
-    return Environment(pixels, scale=1.5, rotation_deg=35.0)
+    return Environment(pixels, scale=1.5, rotation_deg=-55.0)

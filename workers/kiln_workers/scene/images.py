@@ -1,6 +1,6 @@
-"""Decoding of PNG, JPEG, WebP, OpenEXR and Radiance HDR images from bytes with OpenImageIO.
+"""Decoding of PNG, JPEG, WebP, OpenEXR and Radiance HDR images with OpenImageIO, and of KTX2 (`basis`), from bytes.
 
-The format is told by the first bytes, not by the file's name, and only these five formats are ever given to a decoder.
+The format is told by the first bytes, not by the file's name, and only these formats are ever given to a decoder.
 OpenImageIO's Python module opens files only, so the bytes pass through a temporary file whose suffix fits the format.
 Row 0 is the top of the picture. Colours are as the file stores them: OpenImageIO would multiply them by alpha, and
 glTF's alpha (3.9.4) does not darken a colour.
@@ -17,6 +17,7 @@ import numpy.typing as npt
 import OpenImageIO as oiio
 
 from kiln_schemas.errors import InputError
+from kiln_workers.scene.basis import decode_ktx2
 from kiln_workers.scene.limits import MAX_IMAGE_BYTES, MAX_PIXELS, MAX_SIDE, check_count
 from kiln_workers.scene.model import Float32, Image
 
@@ -26,9 +27,10 @@ SIGNATURES: Final[Mapping[str, bytes]] = {
     "exr": b"\x76\x2f\x31\x01",
     "hdr": b"#?",
     "webp": b"RIFF",
+    "ktx2": b"\xabKTX 20\xbb\r\n\x1a\n",
 }
 HDR_FORMATS: Final = frozenset({"exr", "hdr"})
-LOW_RANGE: Final = frozenset({"png", "jpg", "webp"})
+LOW_RANGE: Final = frozenset({"png", "jpg", "webp", "ktx2"})
 """Formats whose colours are encoded as sRGB says."""
 DECODERS: Final[Mapping[str, str]] = {"png": "png", "jpg": "jpeg", "exr": "openexr", "hdr": "hdr", "webp": "webp"}
 """OpenImageIO's names of the formats."""
@@ -56,8 +58,12 @@ def decode_image(data: bytes, where: str, most_bytes: int = MAX_IMAGE_BYTES) -> 
     kind = image_format(data)
     if kind is None:
         raise InputError(
-            "is neither PNG, JPEG, WebP, OpenEXR nor Radiance HDR", where=where, remedy="Convert it to one of these."
+            "is neither PNG, JPEG, WebP, KTX2, OpenEXR nor Radiance HDR",
+            where=where,
+            remedy="Convert it to one of these.",
         )
+    if kind == "ktx2":
+        return Decoded(decode_ktx2(data, where, most_bytes), kind)
     with tempfile.TemporaryDirectory(prefix="kiln-image-") as folder:
         path = Path(folder) / f"image.{kind}"
         path.write_bytes(data)

@@ -1,6 +1,6 @@
 """One door for scenes: the reader is chosen by the entry's suffix, the environment is added, and the whole is checked.
 
-glTF and GLB are the main format; OBJ, PLY and Mitsuba XML become the same model.
+glTF and GLB are the main format; OBJ, PLY, STL, OFF and Mitsuba XML become the same model.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,6 +18,7 @@ from kiln_workers.scene.model import Scene
 from kiln_workers.scene.obj import read_obj
 from kiln_workers.scene.origin import about_own_centre
 from kiln_workers.scene.ply import read_ply
+from kiln_workers.scene.solids import read_off, read_stl
 
 READERS: Final[Mapping[str, Callable[[Path, str], Scene]]] = {
     ".gltf": read_gltf,
@@ -25,6 +26,16 @@ READERS: Final[Mapping[str, Callable[[Path, str], Scene]]] = {
     ".obj": read_obj,
     ".ply": read_ply,
     ".xml": read_mitsuba_xml,
+    ".stl": read_stl,
+    ".off": read_off,
+}
+CONVERTERS: Final[Mapping[str, str]] = {
+    ".fbx": "Convert it with FBX2glTF, or open it in Blender and export glTF.",
+    ".blend": "Open it in Blender and export glTF.",
+    **dict.fromkeys(
+        (".dae", ".3ds", ".x3d", ".usd", ".usda", ".usdc", ".usdz", ".abc"), "Import it into Blender and export glTF."
+    ),
+    **dict.fromkeys((".max", ".ma", ".mb", ".c4d", ".skp"), "Export glTF (or FBX, for FBX2glTF) from its own program."),
 }
 
 
@@ -32,11 +43,9 @@ def load_scene(folder: Path, entry: str, environment: EnvironmentRef | None = No
     """The scene `entry` of the bundle in `folder` under `environment`; InputError says what is wrong with it."""
     reader = READERS.get(PurePosixPath(entry).suffix.lower())
     if reader is None:
-        raise InputError(
-            f"'{PurePosixPath(entry).suffix}' is not a scene format that is read",
-            where=entry,
-            remedy=f"Use one of {', '.join(READERS)}.",
-        )
+        suffix = PurePosixPath(entry).suffix
+        remedy = CONVERTERS.get(suffix.lower(), f"Use one of {', '.join(READERS)}.")
+        raise InputError(f"'{suffix}' is not a scene format that is read", where=entry, remedy=remedy)
     with deadline(READING_S, entry, "read", "Simplify it, or save it as GLB."):
         return _read(reader, folder, entry, environment)
 
