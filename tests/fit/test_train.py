@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from kiln_workers.fit.metrics import exposure_of, texel_errors
 from kiln_workers.fit.network import Shape, initial_parameters
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.source import ArraySource
-from kiln_workers.fit.train import train
+from kiln_workers.fit.train import _refuse_failure, train
 from kiln_workers.sphere import gaussian, octahedral
 
 SHORT = FitSettings(lobes=4, steps=40, batch=10, window=24)
@@ -95,6 +96,20 @@ def test_a_fit_that_collapses_fails_with_its_numbers(lobe_source: ArraySource) -
     assert "fit.start_steps (now 40)" in (caught.value.remedy or "") and caught.value.where == "fit light_field"
 
 
+def test_the_remedy_of_a_failure_fits_its_cause() -> None:
+    """Too few texels, hardly any light, or a fit that did not come far enough."""
+
+    def remedy(texels: int, signal: float) -> str:
+        errors = SimpleNamespace(error=np.ones(texels), log_mse=signal, log_mse_zero=signal, log_mse_rel=1.0)
+        with pytest.raises(FitFailed) as caught:
+            _refuse_failure(errors, LIGHT, SHORT)  # type: ignore[arg-type]
+        return caught.value.remedy or ""
+
+    assert remedy(3, 1.0).startswith("Only 3 texels of the light map can be fitted: raise lightmap.resolution")
+    assert remedy(500, 1e-9).startswith("Hardly any light reaches the surfaces")
+    assert remedy(500, 1.0).startswith("Raise fit.")
+
+
 def test_darkness_is_no_failure(lobe_source: ArraySource) -> None:
     dark = ArraySource(np.zeros_like(lobe_source._images), lobe_source._normals)
     for function in Function:
@@ -142,6 +157,7 @@ def test_every_checkpoint_resumes_to_the_same_bytes(lobe_source: ArraySource) ->
 _RESUMABLE = """
 import sys, time
 from pathlib import Path
+from types import SimpleNamespace
 sys.path.insert(0, sys.argv[1])
 from conftest import made_of_lobes
 from kiln_schemas.settings import FitSettings, Function

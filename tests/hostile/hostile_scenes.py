@@ -161,7 +161,7 @@ def _documents() -> Iterator[Bad]:
     yield raw("nothing", "valid glTF", b"")
     yield raw("text", "valid glTF", b"solid cube")
     yield raw("invalid UTF-8", "valid glTF", b'{"asset": {"version": "\xff\xfe"}}')
-    yield raw("half a surrogate pair", "valid glTF", b'{"asset": {"version": "\\ud800"}}')
+    yield raw("half a surrogate pair", "is glTF", b'{"asset": {"version": "\\ud800"}}')
     yield raw("100000 brackets", "valid glTF", b"[" * 100_000)
     deep = b'{"asset": {"version": "2.0"}, "extras": ' + b'{"a":' * 100_000 + b"1" + b"}" * 100_000 + b"}"
     yield raw("nested 100000 deep", "valid glTF", deep)
@@ -179,7 +179,7 @@ def _documents() -> Iterator[Bad]:
     yield raw("200001 extensions", "at most 200000", lambda: many)
     yield spoilt("no version", "version", ("asset", {}))
     yield spoilt("version 3", "glTF 3.0", ("asset.version", "3.0"))
-    yield spoilt("Draco", "KHR_draco", ("extensionsRequired", ["KHR_draco_mesh_compression"]))
+    yield spoilt("splats", "KHR_gaussian_splatting", ("extensionsRequired", ["KHR_gaussian_splatting"]))
     for place, value in (
         *(("nodes", "many"), ("nodes", {}), ("nodes", [7]), ("nodes.0.mesh", "x"), ("nodes.0.mesh", -1)),
         *(("nodes.0.mesh", 2**31), ("nodes.0.mesh", 1.5), ("nodes.0.matrix", [1] * 15), ("nodes.0.matrix", "identity")),
@@ -441,7 +441,7 @@ def _images() -> Iterator[Bad]:
     # Of scene files
     yield spoilt("a texture that there is not", "texture 0", TEXTURED[0])
     yield spoilt("an image that there is not", "image 0", *TEXTURED)
-    yield spoilt("a texture without a source", "no PNG or JPEG", TEXTURED[0], ("textures", [{}]))
+    yield spoilt("a texture without a source", "no image that is read", TEXTURED[0], ("textures", [{}]))
     yield spoilt("a sampler that there is not", "sampler 4", TEXTURED[0], ("textures", [{"source": 0, "sampler": 4}]))
     yield spoilt("an image of nothing", "neither a URI", *TEXTURED, ("images", [{}]))
     yield spoilt("an image in a view that there is not", "buffer view 50", *TEXTURED, ("images", [{"bufferView": 50}]))
@@ -511,7 +511,7 @@ def _objs() -> Iterator[Bad]:
     yield obj("100001 objects", "at most 100000", objects)
     yield raw("nothing", "no faces", b"", "scene.obj")
     yield raw("no light", "nothing in the scene emits", FACE.encode(), "scene.obj")
-    yield raw("UTF-16", "no faces", FACE.encode("utf-16"), "scene.obj")
+    yield raw("UTF-16 without its mark", "no faces", FACE.encode("utf-16-le"), "scene.obj")
 
 
 def ply(name: str, word: str, header: str, body: bytes = b"", form: str = "ascii 1.0") -> Bad:
@@ -530,13 +530,13 @@ def _plys() -> Iterator[Bad]:
     def header(vertices: object = 3, faces: object = 1, rest: str = LIST) -> str:
         return f"element vertex {vertices}\n{XYZ}element face {faces}\n{rest}"
 
-    yield ply("2^31-1 vertices", "cut off", header(vertices=2**31 - 1), corners, little)
-    yield ply("10^17 vertices", "cut off", header(vertices=10**17), corners, little)
-    yield ply("10^40 vertices", "cannot be read", header(vertices=10**40), corners, little)
-    yield ply("2^31-1 faces", "cut off", header(faces=2**31 - 1), corners, little)
-    yield ply("2^31-1 faces in letters", "cut off", header(faces=2**31 - 1), b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    yield ply("2^31-1 vertices", "rows of vertex", header(vertices=2**31 - 1), corners, little)
+    yield ply("10^17 vertices", "rows of vertex", header(vertices=10**17), corners, little)
+    yield ply("10^40 vertices", "rows of vertex", header(vertices=10**40), corners, little)
+    yield ply("2^31-1 faces", "rows of face", header(faces=2**31 - 1), corners, little)
+    yield ply("2^31-1 faces in letters", "rows of face", header(faces=2**31 - 1), b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     yield ply("-5 vertices", "scene.ply", header(vertices=-5), corners, little)
-    yield ply("many vertices", "cannot be read", header(vertices="many"), corners, little)
+    yield ply("many vertices", "is not understood", header(vertices="many"), corners, little)
     counts = header(rest="property list uint int vertex_indices\n")
     yield ply(
         "a face of 2^32-1 corners", "scene.ply", counts, corners + struct.pack("<I3i", 2**32 - 1, 0, 1, 2), little
@@ -546,8 +546,8 @@ def _plys() -> Iterator[Bad]:
     yield ply("a corner before", "names vertex -7", header(), corners + struct.pack("<B3i", 3, 0, 1, -7), little)
     nan = struct.pack("<9f", 0, 0, 0, float("nan"), 0, 0, 0, 1, 0)
     yield ply("NaN", "vertex 1", header(), nan + struct.pack("<B3i", 3, 0, 1, 2), little)
-    yield ply("a type that there is not", "cannot be read", header().replace("float x", "quad x"), corners, little)
-    yield ply("a format that there is not", "no faces", header(), corners, "rot13 1.0")
+    yield ply("a type that there is not", "is not understood", header().replace("float x", "quad x"), corners, little)
+    yield ply("a format that there is not", "is not understood", header(), corners, "rot13 1.0")
     yield ply("letters", "cannot be read", header(), b"a b c\nd e f\ng h i\n3 0 1 2\n")
     yield ply(
         "a texture file outside",
@@ -555,8 +555,8 @@ def _plys() -> Iterator[Bad]:
         "comment TextureFile /etc/passwd\n" + header(),
         b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
     )
-    yield raw("no header", "cannot be read", b"ply\n", "scene.ply")
-    yield raw("nothing", "cannot be read", b"", "scene.ply")
+    yield raw("no header", "no PLY file", b"ply\n", "scene.ply")
+    yield raw("nothing", "no PLY file", b"", "scene.ply")
     yield raw("a header without an end", "scene.ply", b"ply\nformat ascii 1.0\n" + b"comment x\n" * 10_000, "scene.ply")
 
 

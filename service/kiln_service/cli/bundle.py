@@ -7,6 +7,7 @@ the entry too may be a link inside its folder only. An environment may lie anywh
 as `environment/<name>`, and its folder bounds its links.
 """
 
+import codecs
 import hashlib
 import io
 import json
@@ -25,6 +26,7 @@ from pydantic import ValidationError
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.files import LeavesFolder, NotRegular, is_inside, open_inside
+from kiln_schemas.formats import CONVERTERS
 from kiln_schemas.job import check_bundle, check_bundle_path
 from kiln_schemas.tasks import Bundle, EnvironmentRef
 from kiln_schemas.text import told
@@ -79,8 +81,8 @@ def collect(
     if not scene.exists():
         raise InputError("there is no such scene file", where=str(scene), remedy="Check the path.")
     if reader is None:
-        known = ", ".join(READERS)
-        raise InputError(f"'{scene.suffix}' is not a scene format", where=str(scene), remedy=f"Known: {known}.")
+        remedy = CONVERTERS.get(scene.suffix.lower(), f"Known: {', '.join(READERS)}.")
+        raise InputError(f"'{scene.suffix}' is not a scene format", where=str(scene), remedy=remedy)
     folder = scene.parent.resolve()
     entry = check_bundle_path(scene.name)
     places, referrers = {entry: (folder, entry)}, {entry: str(scene)}
@@ -219,11 +221,14 @@ def _mtl(folder: Path, name: str) -> References:
 
 def _statements(folder: Path, name: str, keys: set[str]) -> Iterator[str]:
     """Arguments of the statements with one of these keywords, line by line."""
-    with io.TextIOWrapper(_open(folder, name, name), encoding="utf-8", errors="replace") as file:
+    with _open(folder, name, name) as file:
+        wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    encoding = "utf-16" if wide else "utf-8-sig"
+    with io.TextIOWrapper(_open(folder, name, name), encoding=encoding, errors="replace") as file:
         for line in file:
-            key, _, arguments = line.strip().partition(" ")
-            if key.lower() in keys and arguments.strip():
-                yield arguments.strip()
+            words = line.split(None, 1)
+            if len(words) == 2 and words[0].lower() in keys:
+                yield words[1].strip()
 
 
 def _map_file(arguments: str) -> str:
@@ -291,4 +296,6 @@ READERS: Final[Mapping[str, Callable[[Path, str], References]]] = {
     ".obj": _obj,
     ".ply": _nothing,
     ".xml": _mitsuba_xml,
+    ".stl": _nothing,
+    ".off": _nothing,
 }

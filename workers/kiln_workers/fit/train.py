@@ -230,15 +230,30 @@ def _metrics(errors: TexelErrors, *, signal: bool) -> FitMetrics:
     )
 
 
+FEW_TEXELS: Final = 16
+"""Fewer texels are no map: a network that shares what it learns between texels has nothing to share."""
+DARK: Final = 1e-5
+"""Mean square of the logarithmic signal below which nearly all texels are black."""
+
+
 def _refuse_failure(errors: TexelErrors, function: Function, settings: FitSettings) -> None:
     if not errors.log_mse_rel <= FAILURE_RATIO:  # also true for NaN
         raise FitFailed(
             f"the fit of the {function.value} ended at log_mse {errors.log_mse:.4g}, {errors.log_mse_rel:.0%} of the "
             f"{errors.log_mse_zero:.4g} that no light at all would have (at most {FAILURE_RATIO:.0%} is accepted)",
             where=f"fit {function.value}",
-            remedy=f"Raise fit.{settings.steps_key(function)} (now {settings.steps}) "
-            f"or fit.lobes (now {settings.lobes}).",
+            remedy=_remedy(errors, function, settings),
         )
+
+
+def _remedy(errors: TexelErrors, function: Function, settings: FitSettings) -> str:
+    """What to do about a fit that failed: the light map's size, the scene's light, or the fit itself."""
+    texels = len(errors.error)
+    if texels < FEW_TEXELS:
+        return f"Only {texels} texels of the light map can be fitted: raise lightmap.resolution."
+    if errors.log_mse_zero < DARK:
+        return "Hardly any light reaches the surfaces: check the lights' strength, and to which side its faces look."
+    return f"Raise fit.{settings.steps_key(function)} (now {settings.steps}) or fit.lobes (now {settings.lobes})."
 
 
 def _without_signal(source: TexelSource, shape: Shape, state: _State, seconds: float) -> FitOutcome:

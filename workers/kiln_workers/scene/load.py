@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Final
 
 from kiln_schemas.errors import InputError
+from kiln_schemas.formats import CONVERTERS
 from kiln_schemas.tasks import EnvironmentRef
 from kiln_workers.scene.environment import load_environment
 from kiln_workers.scene.gltf import read_gltf
@@ -28,14 +29,6 @@ READERS: Final[Mapping[str, Callable[[Path, str], Scene]]] = {
     ".xml": read_mitsuba_xml,
     ".stl": read_stl,
     ".off": read_off,
-}
-CONVERTERS: Final[Mapping[str, str]] = {
-    ".fbx": "Convert it with FBX2glTF, or open it in Blender and export glTF.",
-    ".blend": "Open it in Blender and export glTF.",
-    **dict.fromkeys(
-        (".dae", ".3ds", ".x3d", ".usd", ".usda", ".usdc", ".usdz", ".abc"), "Import it into Blender and export glTF."
-    ),
-    **dict.fromkeys((".max", ".ma", ".mb", ".c4d", ".skp"), "Export glTF (or FBX, for FBX2glTF) from its own program."),
 }
 
 
