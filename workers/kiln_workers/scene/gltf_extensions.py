@@ -32,7 +32,15 @@ READ: Final = frozenset(
     }
 )
 HARMLESS: Final = frozenset(
-    {"KHR_xmp", "KHR_xmp_json_ld", "KHR_materials_variants", "KHR_animation_pointer", "KHR_node_hoverability"}
+    {
+        "KHR_animation_pointer",
+        "KHR_interactivity",
+        "KHR_materials_variants",
+        "KHR_node_hoverability",
+        "KHR_node_selectability",
+        "KHR_xmp",
+        "KHR_xmp_json_ld",
+    }
 )
 """They change nothing that a bake could show."""
 SHADING_ONLY: Final = frozenset(
