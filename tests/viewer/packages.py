@@ -141,6 +141,31 @@ def cabinet_scene() -> Scene:
     return Scene(meshes, materials, images, environment=Environment(pixels, 1.0, 70.0))
 
 
+def veils_scene() -> Scene:
+    """Vertex colours, a texture of another UV set, and panes of which two stand behind each other."""
+    smooth = np.add.outer(np.linspace(40, 220, 16), np.linspace(0, 30, 16))
+    images = (Image("colour", np.stack([smooth, smooth.T, 255 - smooth], axis=-1).astype(np.uint8), True),)
+    materials = (
+        Material("painted", base_color=(0.9, 0.8, 0.9, 1.0), metallic=0.6, roughness=0.4),
+        Material("tiles", base_color_texture=TextureRef(0, uv_set=1), roughness=0.5),
+        Material("tinted", base_color=(0.9, 0.3, 0.2, 0.4), roughness=0.4, blend=True, double_sided=True),
+        Material("glass", base_color=(1.0, 1.0, 1.0, 1.0), roughness=0.4, transmission=0.8),
+    )
+    floor = _quad("floor", 0, (-2, 0, 1.5), (4, 0, 0), (0, 0, -3), (0.05, 0.05, 0.4))
+    wall = _quad("wall", 1, (-2, 0, -1.5), (4, 0, 0), (0, 2, 0), (0.55, 0.05, 0.4))
+    colours = np.float32([[1, 0.2, 0.2, 1], [0.2, 1, 0.2, 1], [0.2, 0.2, 1, 1], [1, 1, 1, 1]])
+    square = np.float32([[0, 2], [3, 2], [3, 0], [0, 0]])
+    meshes = (
+        replace(floor, colors=colours),
+        replace(wall, more_uv=(square,)),
+        _quad("far pane", 2, (-1.2, 0.1, -0.6), (1.6, 0, 0.1), (0, 1.2, 0), (0.05, 0.55, 0.2)),
+        _quad("near pane", 2, (-0.6, 0.2, 0.5), (1.4, 0, -0.1), (0, 0.9, 0), (0.3, 0.55, 0.2)),
+        _quad("glass", 3, (0.9, 0.1, 0.2), (0.8, 0, 0.2), (0, 1.1, 0), (0.55, 0.55, 0.2)),
+    )
+    pixels = np.linspace(0.2, 2.0, 16 * 32 * 3, dtype=np.float32).reshape(16, 32, 3)
+    return Scene(meshes, materials, images, environment=Environment(pixels, 1.0, 70.0))
+
+
 def room_scene() -> Scene:
     """A closed room of 4 x 2.5 x 6 m with a solid block in its middle; its walls are seen from inside only."""
     walls = (
@@ -203,11 +228,12 @@ def courtyard() -> Scene:
     return replace(scene, environment=Environment(np.minimum(scene.environment.pixels, 50.0)[::8, ::8].copy()))
 
 
-SCENES = {"gallery": gallery_scene, "courtyard": courtyard, "cabinet": cabinet_scene}
+SCENES = {"gallery": gallery_scene, "courtyard": courtyard, "cabinet": cabinet_scene, "veils": veils_scene}
 CAMERAS = {
     "gallery": "0.5,2.6,8.5:0,1,-1:42",
     "courtyard": "3,4,9:0,1,0:45",
     "cabinet": "0.4,1.6,4.2:0,0.7,-0.5:45",
+    "veils": "0.4,1.6,4.2:0,0.7,-0.5:45",
 }
 
 

@@ -57,9 +57,13 @@ export function makeShared({ manifest, textures }) {
   };
 }
 
-// The material of a mesh that glTF describes by `described`, a MeshStandardMaterial.
-export function makeMaterial(described, shaders, shared, environment) {
+// The material of a mesh of `geometry` that glTF describes by `described`, a MeshStandardMaterial.
+export function makeMaterial(described, geometry, shaders, shared, environment) {
   const defines = {};
+  const veil = described.transparent || described.transmission > 0;
+  if (veil) defines.LK_BLEND = "";
+  if (geometry.attributes.color) defines.LK_VERTEX_COLOR = "";
+  if (geometry.attributes.uv2) defines.LK_MORE_TEX_COORDS = "";
   if (environment) defines.LK_ENVIRONMENT = "";
   const own = {
     uBaseColor: { value: new THREE.Vector4(...described.color.toArray(), described.opacity) },
@@ -69,6 +73,7 @@ export function makeMaterial(described, shaders, shared, environment) {
     uEmission: { value: described.emissive.clone().multiplyScalar(described.emissiveIntensity) },
     uAlphaCutoff: { value: described.alphaTest },
     uDoubleSided: { value: described.side === THREE.DoubleSide },
+    uTransmission: { value: described.transmission ?? 0 },
   };
   const maps = { BASE_COLOR: "map", METALLIC_ROUGHNESS: "roughnessMap", EMISSION: "emissiveMap" };
   const names = { BASE_COLOR: "uBaseColor", METALLIC_ROUGHNESS: "uMetallicRoughness", EMISSION: "uEmission" };
@@ -76,6 +81,7 @@ export function makeMaterial(described, shaders, shared, environment) {
     const texture = described[key];
     if (!texture) continue;
     defines[`LK_${define}_MAP`] = "";
+    if (texture.channel > 1) defines[`LK_${define}_UV`] = `vTexCoord${texture.channel}`;
     own[`${names[define]}Map`] = { value: texture };
     own[`${names[define]}Transform`] = { value: textureTransform(texture) };
   }
@@ -87,6 +93,10 @@ export function makeMaterial(described, shaders, shared, environment) {
     vertexShader: PRECISION + shaders["surface.vert.glsl"],
     fragmentShader: `${PRECISION}#define main lkExampleMain\n${fragment}${GRID}`,
     side: THREE.DoubleSide,
+    // Veils are drawn after all else, from back to front; their colour comes multiplied by alpha.
+    transparent: veil,
+    premultipliedAlpha: veil,
+    depthWrite: !veil,
     userData: { roughness: described.roughness },
   });
 }
@@ -100,7 +110,8 @@ function textureTransform({ offset, repeat, rotation }) {
 
 // The attributes under the names that the package's vertex shader reads.
 export function nameAttributes(geometry) {
-  const { position, normal, uv, uv1 } = geometry.attributes;
-  const named = { aPosition: position, aNormal: normal, aTexCoord0: uv, aTexCoord1: uv1 };
-  for (const [name, attribute] of Object.entries(named)) geometry.setAttribute(name, attribute);
+  const { position, normal, uv, uv1, uv2, uv3, color } = geometry.attributes;
+  const named = { aPosition: position, aNormal: normal, aTexCoord0: uv, aTexCoord1: uv1, aColor: color };
+  Object.assign(named, { aTexCoord2: uv2, aTexCoord3: uv3 ?? uv2 });
+  for (const [name, attribute] of Object.entries(named)) if (attribute) geometry.setAttribute(name, attribute);
 }

@@ -94,7 +94,7 @@ export class Picture {
     this.bounds = new THREE.Box3();
     for (const mesh of opened.meshes) {
       nameAttributes(mesh.geometry);
-      mesh.material = makeMaterial(mesh.material, opened.shaders, this.shared, this.hasEnvironment);
+      mesh.material = makeMaterial(mesh.material, mesh.geometry, opened.shaders, this.shared, this.hasEnvironment);
       this.scene.attach(mesh);
       this.bounds.expandByObject(mesh);
     }
