@@ -3,12 +3,13 @@
 # make lint   the static part of it
 # make chaos  bakes under 200 faults: killed processes, cut wires, flipped bytes, set clocks (about an hour)
 # make hostile  thousands of attacks while another client bakes, then schemathesis at length (about half an hour)
+# make hostile-commands  every command of the command line with each option at odd values (about an hour)
 # make venv   the virtual environment in .venv that these use
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test hostile lint node chromium faketime chaos clean
+.PHONY: help venv demo test hostile hostile-commands lint node chromium faketime chaos clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -56,6 +57,9 @@ FARM_TESTS := tests/e2e:tests/store:tests/hostile
 hostile: venv
 	PYTHONPATH=$(FARM_TESTS) $(BIN)/python tests/hostile/siege.py --json docs/results/hostile.json --page docs/results/hostile.md
 	LIGHTKILN_HOSTILE_EXAMPLES=400 $(BIN)/pytest tests/hostile/test_openapi.py -q -rP
+
+hostile-commands: venv
+	LIGHTKILN_HOSTILE_COMMANDS=100000 $(BIN)/pytest tests/hostile/test_commands_hostile.py -q -rP
 
 chaos: venv faketime
 	PYTHONPATH=$(FARM_TESTS) $(BIN)/python tests/chaos/chaos.py --store disk --faults 120 --json docs/results/chaos-disk.json
