@@ -5,6 +5,7 @@ random numbers are seeded from that hash. So two jobs with the same key have the
 later one reads the earlier one's, once the coordinator has looked whether they are still there.
 """
 
+import asyncio
 import hashlib
 import json
 from collections.abc import Sequence
@@ -39,7 +40,10 @@ def render_key(result: PrepareResult, settings: BakeSettings) -> str:
         "lightmap": settings.lightmap.model_dump(mode="json"),
         "render": settings.render.model_dump(mode="json"),
     }
-    return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
+    digest = hashlib.sha256()
+    for piece in json.JSONEncoder(sort_keys=True).iterencode(depends):  # unlike `dumps` it lets other threads run
+        digest.update(piece.encode())
+    return digest.hexdigest()
 
 
 async def check_sources(
@@ -55,7 +59,7 @@ async def check_sources(
     job = replace(JobRow.of(row), prepared=result.model_dump(mode="json", exclude={"tiles"}))
     places = [(tile.row, tile.column) for tile in result.tiles]
     async with database.transaction() as tx:
-        rows = await tx.all("find_sources", id=job.id, **_wanted(job, result))
+        rows = await tx.all("find_sources", id=job.id, **await asyncio.to_thread(_wanted, job, result))
     looks: dict[str, Look] = {}
     for store_url in {row["store_url"] for row in rows}:
         looks[store_url] = await look(config, store_url, job, places)
@@ -64,7 +68,7 @@ async def check_sources(
 
 async def renders_to_reuse(tx: Tx, job: JobRow, result: PrepareResult, sources: Sequence[str]) -> Renders | None:
     """The newest of these jobs that still has the same light fields, all of them; the job is locked."""
-    wanted = _wanted(job, result)
+    wanted = await asyncio.to_thread(_wanted, job, result)
     await tx.run("set_render_key", id=job.id, key=wanted["key"])
     row = await tx.maybe("find_renders", id=job.id, sources=list(sources), **wanted)
     return None if row is None else Renders(row["id"], row["store_url"])

@@ -4,6 +4,8 @@ Each function is one move of the tables in `kiln_schemas.states`; an illegal one
 caller has locked the job and, for a move of a task, the task (`Tx`'s order of locks).
 """
 
+import asyncio
+import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -35,6 +37,8 @@ COORDINATOR: Final = "coordinator"
 """The actor of what nobody asked for."""
 MANY_TASKS: Final = 500
 """So many new ones change which way of finding the next is the fastest."""
+PIECE: Final = 2000
+"""So many tasks at a time are planned and sent: all of a large light map at once would hold up everybody else."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,21 @@ async def create_job(
 
 async def add_tasks(tx: Tx, job: JobRow, planned: Sequence[Planned]) -> None:
     """New tasks of a job: queued where ready, waiting otherwise."""
+    for start in range(0, len(planned), PIECE):
+        rows = await asyncio.to_thread(_rows, job, planned[start : start + PIECE])
+        await tx.run("insert_tasks", job_id=job.id, tasks=Jsonb(rows, dumps=str))
+    if len(planned) >= MANY_TASKS:
+        await tx.run("analyze_tasks")
+    if ready := {task.kind for task in planned if task.ready}:
+        await queue.announce(tx, ready)
+    counts: dict[str, int] = {}
+    for task in planned:
+        counts[task.kind.value] = counts.get(task.kind.value, 0) + 1
+    await add_event(tx, job.id, "tasks.planned", COORDINATOR, detail=counts)
+
+
+def _rows(job: JobRow, planned: Sequence[Planned]) -> str:
+    """Rows of the query `insert_tasks` as JSON."""
     rows = [
         {
             "id": new_id(),
@@ -102,15 +121,7 @@ async def add_tasks(tx: Tx, job: JobRow, planned: Sequence[Planned]) -> None:
         }
         for place, task in enumerate(planned)
     ]
-    await tx.run("insert_tasks", job_id=job.id, tasks=Jsonb(rows))
-    if len(rows) >= MANY_TASKS:
-        await tx.run("analyze_tasks")
-    if ready := {task.kind for task in planned if task.ready}:
-        await queue.announce(tx, ready)
-    counts: dict[str, int] = {}
-    for task in planned:
-        counts[task.kind.value] = counts.get(task.kind.value, 0) + 1
-    await add_event(tx, job.id, "tasks.planned", COORDINATOR, detail=counts)
+    return json.dumps(rows)
 
 
 async def release_tasks(tx: Tx, job: JobRow, kind: TaskKind) -> None:
@@ -175,9 +186,14 @@ async def requeue_task(tx: Tx, task: TaskRow, kind: str, actor: str, *, strike: 
 async def complete_task(tx: Tx, task: TaskRow, result: Result) -> None:
     """active > completed."""
     check_task_move(task.state, TaskState.COMPLETED)
-    await _move(tx, "move_task_completed", task, result=Jsonb(result.model_dump(mode="json")))
+    await _move(tx, "move_task_completed", task, result=Jsonb(result, dumps=_json))
     await _need_no_checkpoint(tx, task)
     await _task_event(tx, task, "task.completed", f"worker:{task.worker_id}", {"seconds": result.seconds})
+
+
+def _json(result: Result) -> str:
+    """A result as JSON, which takes a quarter of the time that objects of JSON take."""
+    return result.model_dump_json()
 
 
 async def fail_task(tx: Tx, task: TaskRow, problem: Problem, actor: str) -> None:

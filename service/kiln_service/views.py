@@ -13,7 +13,7 @@ from kiln_schemas.job import CurveView, JobPage, JobView, StageView, TaskView
 from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState
 from kiln_schemas.tasks import Artifact, TaskKind
 from kiln_service.config import ServiceConfig
-from kiln_service.db import Database, JobRow, TaskRow, Tx, job_rows, readable, readable_rows
+from kiln_service.db import Database, JobRow, Tx, job_rows, readable, readable_rows
 from kiln_service.db.lenient import note_unreadable
 from kiln_service.planner import METHODS
 from kiln_service.waiting import reasons
@@ -225,24 +225,6 @@ def _stage_view(row: DictRow) -> StageView:
         fraction=min((row["completed"] + sum(row["fractions"] or [])) / row["total"], 1.0),
         seconds=max(row["seconds"], 0.0),  # a clock that was set back makes it negative
     )
-
-
-def task_view(task: TaskRow, worker: str | None) -> TaskView:
-    """A task with the name of its worker."""
-    values = {
-        "id": task.id,
-        "kind": task.kind,
-        "label": task.label,
-        "state": task.state,
-        "attempt": task.attempt,
-        "worker": worker,
-        "progress": task.progress,
-        "created": task.created,
-        "started": task.started,
-        "finished": task.finished,
-        "error": task.error,
-    }
-    return readable(TaskView, values)
 
 
 async def require_task(database: Database, task_id: str) -> None:

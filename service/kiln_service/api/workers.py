@@ -19,6 +19,7 @@ from kiln_schemas.tasks import (
     WorkerRegistration,
     WorkerWelcome,
 )
+from kiln_service.api.commits import CommitRoute
 from kiln_service.api.common import PartsHere, caller, problems
 from kiln_service.auth import Principal
 
@@ -54,10 +55,19 @@ async def heartbeat(worker_id: str, beat: Heartbeat, parts: PartsHere, who: Work
     return await parts.work.heartbeat(worker_id, beat, who.name)
 
 
-@router.post("/tasks/{task_id}/commit", status_code=204, responses=problems(404, 409, 422))
 async def commit(task_id: str, commit: Commit, parts: PartsHere) -> None:
     """Hand in the result of an attempt. Repeating the same commit is no error. 409 `stale-attempt`: it is not yours."""
     await parts.work.commit(task_id, commit)
+
+
+router.add_api_route(
+    "/tasks/{task_id}/commit",
+    commit,
+    methods=["POST"],
+    status_code=204,
+    responses=problems(404, 409, 422),
+    route_class_override=CommitRoute,
+)
 
 
 @router.post("/tasks/{task_id}/fail", status_code=204, responses=problems(404, 409, 422))

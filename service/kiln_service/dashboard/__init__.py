@@ -9,7 +9,7 @@ from importlib import resources
 from fastapi import FastAPI
 
 from kiln_service.dashboard import atlas, job, jobs, sign_in, submit, workers
-from kiln_service.dashboard.pages import error_page
+from kiln_service.dashboard.pages import compile_templates, error_page
 from kiln_service.static import Files, compressed
 
 __all__ = ["error_page", "install"]
@@ -17,6 +17,7 @@ __all__ = ["error_page", "install"]
 
 def install(app: FastAPI) -> None:
     """Add the pages, their scripts and the vendored ones."""
+    compile_templates()
     for module in (sign_in, jobs, job, atlas, submit, workers):
         app.include_router(module.router)
     folder = resources.files(__package__)

@@ -8,7 +8,7 @@ from fastapi.responses import Response
 from psycopg.rows import DictRow
 
 from kiln_schemas.errors import Conflict, InputError, NotFound
-from kiln_schemas.job import EventView, JobChange, JobView, RequeueRequest
+from kiln_schemas.job import EventView, JobChange, JobView, RequeueRequest, TaskView
 from kiln_schemas.operators import Scope
 from kiln_schemas.states import FINAL_JOB_STATES, LIVE_JOB_STATES, OVER_TASK_STATES, PUBLISHED_JOB_STATES, JobState
 from kiln_schemas.tasks import TaskKind
@@ -17,7 +17,7 @@ from kiln_service.api.common import Parts, PartsHere, caller
 from kiln_service.auth import Principal
 from kiln_service.dashboard.jobs import stretch
 from kiln_service.dashboard.pages import Form, page, see
-from kiln_service.db import Database, TaskRow, readable_rows
+from kiln_service.db import Database, picked, readable_rows
 from kiln_service.task_logs import read_log
 from kiln_service.tile_maps import STATES
 
@@ -73,7 +73,7 @@ async def job(request: Request, job_id: str, parts: PartsHere) -> Response:
         "job.html",
         job=view,
         bars=[(stage, stretch(stage)) for stage in view.stages],
-        tasks=[views.task_view(TaskRow.of(row), row["worker"]) for row in tasks],
+        tasks=[picked(TaskView, row) for row in tasks],
         events=events,
         artifacts=await views.artifacts(parts.database, job_id),
         actions=_allowed(view),
@@ -107,7 +107,7 @@ async def act(job_id: str, action: Action, parts: PartsHere, who: Submitter, _: 
 async def task(request: Request, task_id: str, parts: PartsHere) -> Response:
     """One task and its log, which a script follows while it runs."""
     row = await _task(parts, task_id)
-    view = views.task_view(TaskRow.of(row), row["worker"])
+    view = picked(TaskView, row)
     return page(
         request,
         "task.html",

@@ -139,3 +139,9 @@ _templates = Environment(
 )
 _templates.filters |= {"duration": _duration, "bytes": _bytes, "ago": _ago, "told": _told, "sentence": _sentence}
 _templates.globals |= {"with_query": _with_query}
+
+
+def compile_templates() -> None:
+    """Compile them all: done at the first drawing of a page, it would hold up everybody else."""
+    for name in _templates.list_templates():
+        _templates.get_template(name)

@@ -13,8 +13,10 @@ WHERE job_id = %(job_id)s AND kind = 'render'
   AND (spec -> 'tile' ->> 'row')::int = %(row)s AND (spec -> 'tile' ->> 'column')::int = %(column)s;
 
 -- name: tasks_of_note
--- Tasks of a job that are single, run, or went wrong; of the many others none.
-SELECT tasks.*, CASE WHEN worker_id IS NOT NULL THEN worker_name END AS worker
+-- Tasks of a job that are single, run, or went wrong; of the many others none. (Not their results: the prepare task's may
+-- list 65,536 tiles.)
+SELECT tasks.id, kind, label, state, attempt, CASE WHEN worker_id IS NOT NULL THEN worker_name END AS worker,
+       progress, created, started, finished, error
 FROM tasks
 WHERE job_id = %(job_id)s
   AND (kind NOT IN ('render', 'refine') OR state NOT IN ('waiting', 'queued', 'completed', 'canceled'))
@@ -22,7 +24,9 @@ ORDER BY ordinal LIMIT %(limit)s;
 
 -- name: one_task
 -- A task with its worker's name and its job's state.
-SELECT tasks.*, CASE WHEN worker_id IS NOT NULL THEN worker_name END AS worker, jobs.state AS job_state
+SELECT tasks.id, job_id, kind, label, tasks.state, attempt,
+       CASE WHEN worker_id IS NOT NULL THEN worker_name END AS worker,
+       progress, tasks.created, tasks.started, tasks.finished, tasks.error, jobs.state AS job_state
 FROM tasks JOIN jobs ON jobs.id = tasks.job_id WHERE tasks.id = %(id)s;
 
 -- name: last_events
