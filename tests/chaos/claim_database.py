@@ -1,5 +1,6 @@
 """The farm's database from beside its coordinator: held at a claim, and restarted there with `pg_ctl`."""
 
+import contextlib
 import os
 import subprocess
 import threading
@@ -23,7 +24,8 @@ def restart_in_claim(farm: ChaosFarm, mode: str) -> None:
     folder, own = server.cwd(), "/proc/self/cwd"
     pg_ctl, owner = Path(server.exe()).with_name("pg_ctl"), server.uids().real
     dsn = f"host='{folder}' user=postgres dbname=postgres"
-    with psycopg.connect(dsn, autocommit=False) as holder:
+    # The restart ends the holder's connection, so nothing is left to be committed or rolled back.
+    with contextlib.closing(psycopg.connect(dsn, autocommit=False)) as holder:
         holder.execute("LOCK TABLE tasks IN ACCESS EXCLUSIVE MODE")
         with psycopg.connect(dsn, autocommit=True) as watcher:
             wait_until("a claim waits in its transaction", _claiming(farm, watcher))
