@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Set
+from contextlib import nullcontext
 from typing import Final
 
 from psycopg.rows import DictRow
@@ -54,7 +55,8 @@ async def submit(
     bundle = check_bundle(request.bundle)
     gates = check_gates(request.gates, request.cameras)
     Disk(config).require()
-    async with database.transaction() as tx:
+    turn = database.turn(f"submissions of {who.name} as {key}") if key else nullcontext()
+    async with turn, database.transaction() as tx:
         if (earlier := await _submitted(tx, submission)) is not None:
             return earlier
         if absent := await require_blobs(tx, bundle.files.values()):

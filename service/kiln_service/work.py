@@ -84,7 +84,7 @@ class Work:
                 remedy="Install the same version on both: what they tell each other changes between versions.",
             )
         worker_id = new_id()
-        async with self._database.transaction() as tx:
+        async with self._database.turn(f"workers of {owner}"), self._database.transaction() as tx:
             await self._make_room(tx, owner)
             await tx.run(
                 "insert_worker",
@@ -136,7 +136,8 @@ class Work:
 
     async def _claim_once(self, worker_id: str, kinds: Sequence[TaskKind], owner: str) -> "Handed | _Outcome":
         stale_s = self._config.timing.stale_s
-        async with self._database.transaction() as tx:
+        # What one worker asks at once would otherwise wait for the worker's row with all connections in hand.
+        async with self._database.turn(worker_id), self._database.transaction() as tx:
             worker = await _find_worker(tx, worker_id, owner)
             if worker.orders == "drain":
                 raise Drained("an operator told the worker to leave", where=worker.name)
@@ -175,18 +176,19 @@ class Work:
     async def heartbeat(self, worker_id: str, beat: Heartbeat, owner: str) -> HeartbeatReply:
         """Keep the attempt alive, or tell the worker to stop."""
         progress = beat.progress
-        row = await self._database.first(
-            "beat",
-            worker_id=worker_id,
-            owner=owner,
-            task_id=beat.task_id,
-            attempt=beat.attempt,
-            lease_sha256=digest_of(beat.lease),
-            lines=beat.log if self._disk.shortage() is None else "",
-            progress=Jsonb(progress.model_dump(mode="json")) if progress else None,
-            step=progress.done if progress else None,
-            loss=progress.loss if progress else None,
-        )
+        async with self._database.turn(worker_id):
+            row = await self._database.first(
+                "beat",
+                worker_id=worker_id,
+                owner=owner,
+                task_id=beat.task_id,
+                attempt=beat.attempt,
+                lease_sha256=digest_of(beat.lease),
+                lines=beat.log if self._disk.shortage() is None else "",
+                progress=Jsonb(progress.model_dump(mode="json")) if progress else None,
+                step=progress.done if progress else None,
+                loss=progress.loss if progress else None,
+            )
         if row is None or not row["known"]:
             raise _no_worker(worker_id)
         self._logs.taken(beat.log)

@@ -123,6 +123,10 @@ class Siege:
             "processes_ended": sum(process.poll() is not None for process in self.farm.processes.values()),
         }
 
+    def refused(self) -> list[str]:
+        """What the other client was told where it got no answer or none that it wanted."""
+        return [str(line.get("lost") or line["refused"]) for line in self._lines("lost") + self._lines("refused")]
+
     def bakes(self) -> int:
         """Of the other client, the undisturbed one included."""
         return len(self._lines("bake"))
@@ -236,6 +240,7 @@ def report(siege: Siege) -> dict[str, Any]:
         },
         "undisturbed": delays["undisturbed"],
         "bakes": siege.bakes(),
+        "refused": siege.refused(),
         "coordinator_mb": [size / 1e6 for size in siege.memory],
         **siege.verdicts(),
     }
@@ -282,6 +287,7 @@ def main() -> int:
         result = report(running)
     print(table(result))
     zeros = {key: value for key, value in result.items() if key in running.verdicts()}
+    print(*result["refused"], sep="\n")
     print(zeros, f"{result['bakes']} bakes, memory {result['coordinator_mb']} MB")
     if arguments.page:
         write_page(arguments.page, result)

@@ -124,9 +124,9 @@ class Database:
         async with _within(within_s, "a connection to the database"), self.transaction() as tx:
             await tx.one("ping")
 
-    def turn(self, job_id: str) -> asyncio.Lock:
-        """What transactions that begin by locking this job wait for first; in one coordinator they come in order."""
-        return self._turns.setdefault(job_id, asyncio.Lock())
+    def turn(self, key: str) -> asyncio.Lock:
+        """What those wait for who will lock this job or worker: in order, and with no connection in hand."""
+        return self._turns.setdefault(key, asyncio.Lock())
 
     async def first(self, query: str, **parameters: Any) -> DictRow | None:
         """The first row of one query that is a transaction of its own, or None."""
