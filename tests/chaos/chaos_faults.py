@@ -132,8 +132,8 @@ def _flip_blob(bench: "Bench") -> Repair:
     good = path.read_bytes()
     _flip(path, bench.chance)
     for name in WORKERS:
-        with contextlib.suppress(FileNotFoundError):
-            shutil.rmtree(bench.farm.scratch(name) / "blobs")
+        for copies in bench.farm.scratch(name).glob("*/blobs"):
+            shutil.rmtree(copies, ignore_errors=True)
         bench.farm.kill(name)
     bench.note(f"blob {path.name} of {len(good)} bytes")
 
@@ -147,7 +147,7 @@ def _flip_blob(bench: "Bench") -> Repair:
 def _flip_copy(bench: "Bench") -> None:
     """Of a blob that a worker has fetched."""
     bench.reach(bench.chance.choice(STAGES[1:]))
-    copies = [path for name in WORKERS for path in (bench.farm.scratch(name) / "blobs").glob("*")]
+    copies = [path for name in WORKERS for path in bench.farm.scratch(name).glob("*/blobs/*")]
     if not copies:
         raise MissedTarget("no worker has a blob")
     with contextlib.suppress(FileNotFoundError):
