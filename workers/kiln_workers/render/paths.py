@@ -110,7 +110,11 @@ class PathTracer:
         face = self._face(si)
         pull = dr.gather(mi.Vector4f, self.face_pull, face)
         inside = si.p + pull.w * (mi.Point3f(pull.x, pull.y, pull.z) - si.p)
-        return mi.Point3f(inside - dr.minimum(self._step(si, face, direction), 0.5 * si.t) * direction)
+        back = inside - dr.minimum(self._step(si, face, direction), 0.5 * si.t) * direction
+        # A ray that grazes the face does not get a clearance off it on its way back.
+        side = dr.dot(si.n, direction)
+        missing = dr.maximum(1.0 - dr.abs(side) / LEAST_COSINE, 0.0) * dr.gather(mi.Float, self.face_clearance, face)
+        return mi.Point3f(back - dr.mulsign(missing, side) * si.n)
 
     def beyond(self, si: Any, direction: Any) -> Any:
         """The point [Point3f] on a ray in which it goes on behind a hit."""
