@@ -13,7 +13,7 @@ SHA = "0" * 64
 def body(count, **changes):
     tiles = [{"row": 8 * (i // 256), "column": 8 * (i % 256), "size": 8, "texels": 5} for i in range(count)]
     result = {"kind": "prepare", "scene": SHA, "texel_map": SHA, "scene_hash": SHA, "tiles": tiles, "seconds": 1}
-    result |= {"has_environment": False, "has_light": True, "triangles": 1} | changes
+    result |= {"resolution": 32, "has_environment": False, "has_light": True, "triangles": 1} | changes
     return {"attempt": 1, "lease": "x" * 43, "result": result}
 
 
