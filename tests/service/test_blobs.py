@@ -89,8 +89,10 @@ def test_a_body_shorter_than_announced_is_400(home):
     headers = [(b"authorization", f"Bearer {home.token}".encode()), (b"content-length", b"11")]
     scope = {"type": "http", "method": "PUT", "path": f"/v1/blobs/{SHA256}", "headers": headers}
 
+    body = [{"type": "http.request", "body": DATA[:10], "more_body": False}]
+
     async def receive():
-        return {"type": "http.request", "body": DATA[:10], "more_body": False}
+        return body.pop() if body else await asyncio.Event().wait()  # the client stays
 
     async def send(message):
         sent.append(message)
@@ -211,7 +213,7 @@ def test_within_the_reserve_work_ends_and_nothing_begins(start):
         made = {"seconds": 1.0, "kind": "prepare", "scene": home.upload(b"s")}
         tiles = [{"row": 0, "column": 0, "size": 8, "texels": 5}]
         made |= {"texel_map": home.upload(b"t"), "scene_hash": "0" * 64, "tiles": tiles, "has_light": True}
-        made |= {"has_environment": False, "triangles": 1}
+        made |= {"has_environment": False, "triangles": 1, "resolution": 32}
     with start(limits=Limits(reserve_bytes=2**60)) as full:
         worker.home = full
         assert full.client.put(f"/v1/blobs/{SHA256}", content=DATA).status_code == 507

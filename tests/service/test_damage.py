@@ -180,7 +180,14 @@ def test_a_scene_that_is_prepared_again_as_another_fails_the_job(home):
     claim = worker.must_claim("prepare")
     from_elsewhere = {"kind": "prepare", "seconds": 1.0, "scene": home.upload(b"x"), "texel_map": home.upload(b"y")}
     tiles = [{"row": 0, "column": 0, "size": 8, "texels": 5}]
-    rest = {"scene_hash": "1" * 64, "tiles": tiles, "has_environment": False, "has_light": True, "triangles": 1}
+    rest = {
+        "scene_hash": "1" * 64,
+        "tiles": tiles,
+        "has_environment": False,
+        "has_light": True,
+        "triangles": 1,
+        "resolution": 32,
+    }
     reply = worker.commit(claim, from_elsewhere | rest)
     assert reply.status_code == 422 and "scene_hash and texel_map changed" in reply.json()["detail"]
     assert home.job(job["id"])["state"] == "active"

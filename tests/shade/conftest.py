@@ -84,7 +84,7 @@ def manifest(environment: bool) -> Manifest:
         exposure={},
         metrics=ManifestMetrics(light_field=fitted, visibility=fitted if environment else None),
         textures=maps,
-        lightmap={},
+        lightmap={"width": SIZE, "height": SIZE},
         stage_seconds={},
         overflows=0,
         versions={},

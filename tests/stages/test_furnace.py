@@ -138,8 +138,9 @@ def mirrored(scene: Scene, environment: Environment) -> Scene:
         )
         for mesh in scene.meshes
     )
-    # The image's middle column looks along -Z or +Z, so turning the columns over mirrors x.
-    return replace(scene, meshes=meshes, environment=Environment(environment.pixels[:, ::-1].copy()))
+    # The image's middle column looks along +X and its quarters along -Z and +Z, about which the columns are turned over.
+    pixels = np.roll(environment.pixels[:, ::-1], environment.pixels.shape[1] // 2, axis=1)
+    return replace(scene, meshes=meshes, environment=Environment(pixels))
 
 
 def test_a_mirrored_scene_gives_the_mirrored_picture(tmp_path: Path) -> None:

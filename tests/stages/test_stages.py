@@ -130,7 +130,8 @@ def test_light_fields_between_are_those_of_a_texel_map_moved_by_half_a_texel(bak
             near = moved[kind].position[r, c] - 0.5 * (
                 texel_map.position[r, c] + texel_map.position[r + down, c + right]
             )
-            assert np.abs(near).max() < 1e-3, "the room is flat"
+            # The room is flat; points at the edges of faces are pulled in by a fiftieth of a texel.
+            assert np.abs(near).max() < 0.03 * texel_map.texel_size[r, c].max()
             brightness += sparse[counts, kind].tolist()
             expected += (0.5 * (means[r, c] + means[r + down, c + right])).tolist()
     assert empty > 0 and len(brightness) > 100
