@@ -138,7 +138,7 @@ def mirrored(scene: Scene, environment: Environment) -> Scene:
         )
         for mesh in scene.meshes
     )
-    # The image's middle column looks along +X and its quarters along -Z and +Z, about which the columns are turned over.
+    # The middle column looks along +X, its quarters along -Z and +Z: the columns are turned over about those.
     pixels = np.roll(environment.pixels[:, ::-1], environment.pixels.shape[1] // 2, axis=1)
     return replace(scene, meshes=meshes, environment=Environment(pixels))
 
