@@ -25,7 +25,7 @@ from kiln_workers.scene.gltf import read_gltf
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.origin import about_own_centre
 from kiln_workers.shade.package import read_manifest
-from kiln_workers.store.light_field import LightFieldStore
+from kiln_workers.store.light_field import LightFieldStore, open_named
 
 KEPT: Final = ".lightkiln"
 """Folder inside a package's in which `lightkiln bake --keep` leaves its data."""
@@ -67,7 +67,7 @@ def open_subject(named: str, package: Path | None, store: str | None, env: Path 
     folder = package or _package_of(named)
     manifest = read_manifest(folder)
     url = _store_url(named, folder, manifest, store)
-    opened = LightFieldStore.open(url)
+    opened = open_named(url)
     if Function.LIGHT_FIELD not in opened.functions:
         raise InputError("the store has no light field", where=url)
     if Function.LIGHT_FIELD.value not in manifest.exposure:

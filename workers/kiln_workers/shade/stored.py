@@ -18,7 +18,7 @@ from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.shade import algorithm, textures
 from kiln_workers.sphere import octahedral
-from kiln_workers.store.light_field import LightFieldStore
+from kiln_workers.store.light_field import LightFieldStore, open_named
 
 KERNEL_VALUES = 1 << 22
 """Values of D that are computed at once."""
@@ -36,7 +36,7 @@ class StoredImages:
     @classmethod
     def open(cls, url: str, shape: tuple[int, int]) -> "StoredImages":
         """Open a store whose light map has `shape`; InputError where it belongs to another package."""
-        store = LightFieldStore.open(url)
+        store = open_named(url)
         if store.shape != shape:
             raise InputError(
                 f"its light map is {store.shape[1]} x {store.shape[0]}, the package's {shape[1]} x {shape[0]}",

@@ -342,6 +342,16 @@ def _read_group(url: str) -> dict[str, Any] | None:
     return attributes
 
 
+def open_named(url: str) -> LightFieldStore:
+    """The store that a person has named; NotFound where there is none."""
+    try:
+        return LightFieldStore.open(url)
+    except StoreLost:
+        raise NotFound(
+            "there is no light-field store", where=url, remedy="Name the folder of a store, JOB.zarr."
+        ) from None
+
+
 def _store_lost(url: str, what: str) -> StoreLost:
     return StoreLost(
         f"the light-field store cannot be used: {what}",
