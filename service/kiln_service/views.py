@@ -11,10 +11,10 @@ from pydantic import ValidationError
 from kiln_schemas.errors import InputError, InternalError, NotFound
 from kiln_schemas.job import CurveView, JobPage, JobView, StageView, TaskView
 from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState
-from kiln_schemas.tasks import Artifact, TaskKind
+from kiln_schemas.tasks import Artifact, Progress, TaskKind
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, JobRow, Tx, job_rows, readable, readable_rows
-from kiln_service.db.lenient import note_unreadable
+from kiln_service.db.lenient import note_unreadable, readable_or, readable_problem
 from kiln_service.planner import METHODS
 from kiln_service.waiting import reasons
 
@@ -101,8 +101,14 @@ async def task_page(
         else:
             rows = await tx.all("page_of_changed_tasks", **about, since=since, limit=limit + 1)
     following = rows[limit - 1]["ordinal"] if len(rows) > limit else None
-    tasks = tuple(TaskView.model_validate({k: v for k, v in row.items() if k != "ordinal"}) for row in rows[:limit])
-    return TaskPage(tasks, following, version["version"])
+    return TaskPage(tuple(readable_rows(TaskView, map(_task_values, rows[:limit]))), following, version["version"])
+
+
+def _task_values(row: DictRow) -> DictRow:
+    """A row of `page_of_tasks` as a `TaskView` has it; what an older version stored is read as far as it can be."""
+    values = {name: value for name, value in row.items() if name != "ordinal"}
+    progress, error = readable_or(Progress, row["progress"], None), readable_problem(row["error"])
+    return values | {"progress": progress, "error": error}
 
 
 async def curves(database: Database, job_id: str) -> tuple[CurveView, ...]:

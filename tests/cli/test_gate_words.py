@@ -51,7 +51,7 @@ def test_gates_that_are_refused(word: str, why: str) -> None:
         ("a=", "cannot be read"),
         ("a=0,0,0:0,0,0:40", "coincide"),
         ("a=0,0,0:0,5,0:40", "along"),
-        ("a=0,0,0:1e7,0,0:40", "target.0"),
+        ("a=0,0,0:2e7,0,0:40", "target.0"),
         ("a=0,0,0:1,1,1:180", "fov_deg"),
         ("a=0,0:1,1,1:40", "position"),
         ("a=0,0,inf:1,1,1:40", "position"),

@@ -18,7 +18,9 @@ from kiln_service.jobs import lock_job
 
 def moves(row, job):
     """Every move of a task by name, as a function of a transaction."""
-    worker = WorkerRow(id=row.worker_id or "", name="w", kinds=(), tags=(), orders="work", asleep=False)
+    worker = WorkerRow(
+        id=row.worker_id or "", name="w", kinds=(), tags=(), orders="work", asleep=False, owner="", registrant=""
+    )
     problem = transitions.IllegalTransition("x").problem()
 
     async def claim(tx):
