@@ -101,10 +101,10 @@ async def task_page(
         else:
             rows = await tx.all("page_of_changed_tasks", **about, since=since, limit=limit + 1)
     following = rows[limit - 1]["ordinal"] if len(rows) > limit else None
-    return TaskPage(tuple(readable_rows(TaskView, map(_task_values, rows[:limit]))), following, version["version"])
+    return TaskPage(tuple(readable_rows(TaskView, map(task_values, rows[:limit]))), following, version["version"])
 
 
-def _task_values(row: DictRow) -> DictRow:
+def task_values(row: DictRow) -> DictRow:
     """A row of `page_of_tasks` as a `TaskView` has it; what an older version stored is read as far as it can be."""
     values = {name: value for name, value in row.items() if name != "ordinal"}
     progress, error = readable_or(Progress, row["progress"], None), readable_problem(row["error"])

@@ -73,7 +73,7 @@ async def job(request: Request, job_id: str, parts: PartsHere) -> Response:
         "job.html",
         job=view,
         bars=[(stage, stretch(stage)) for stage in view.stages],
-        tasks=[picked(TaskView, row) for row in tasks],
+        tasks=[picked(TaskView, views.task_values(row)) for row in tasks],
         events=events,
         artifacts=await views.artifacts(parts.database, job_id),
         actions=_allowed(view),
@@ -107,7 +107,7 @@ async def act(job_id: str, action: Action, parts: PartsHere, who: Submitter, _: 
 async def task(request: Request, task_id: str, parts: PartsHere) -> Response:
     """One task and its log, which a script follows while it runs."""
     row = await _task(parts, task_id)
-    view = picked(TaskView, row)
+    view = picked(TaskView, views.task_values(row))
     return page(
         request,
         "task.html",
