@@ -11,10 +11,10 @@ from pydantic import ValidationError
 from kiln_schemas.errors import InputError, InternalError, NotFound
 from kiln_schemas.job import CurveView, JobPage, JobView, StageView, TaskView
 from kiln_schemas.states import FINAL_JOB_STATES, JobState, TaskState
-from kiln_schemas.tasks import Artifact, Progress, TaskKind
+from kiln_schemas.tasks import Artifact, TaskKind
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, JobRow, Tx, job_rows, readable, readable_rows
-from kiln_service.db.lenient import note_unreadable, readable_or, readable_problem
+from kiln_service.db.lenient import note_unreadable, readable_outcome
 from kiln_service.planner import METHODS
 from kiln_service.waiting import reasons
 
@@ -107,8 +107,7 @@ async def task_page(
 def task_values(row: DictRow) -> DictRow:
     """A row of `page_of_tasks` as a `TaskView` has it; what an older version stored is read as far as it can be."""
     values = {name: value for name, value in row.items() if name != "ordinal"}
-    progress, error = readable_or(Progress, row["progress"], None), readable_problem(row["error"])
-    return values | {"progress": progress, "error": error}
+    return values | readable_outcome(row)
 
 
 async def curves(database: Database, job_id: str) -> tuple[CurveView, ...]:

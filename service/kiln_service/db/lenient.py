@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from kiln_schemas.base import Contract
 from kiln_schemas.errors import InternalError, Problem
+from kiln_schemas.tasks import Progress
 from kiln_schemas.text import told
 
 log = logging.getLogger(__name__)
@@ -62,6 +63,12 @@ def readable_problem(tree: Any) -> Problem | None:
     """A stored error; where it cannot be read, one that says so."""
     lost = InternalError(told(f"the error that is stored cannot be read: {tree!r}", 1000)).problem()
     return None if tree is None else readable_or(Problem, tree, lost)
+
+
+def readable_outcome(row: DictRow) -> DictRow:
+    """Progress and error of a row of `tasks`; None or a stand-in where they cannot be read."""
+    progress, error = readable_or(Progress, row["progress"], None), readable_problem(row["error"])
+    return {"progress": progress, "error": error}
 
 
 def note_unreadable(what: str, row: DictRow, error: Exception) -> None:

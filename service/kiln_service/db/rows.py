@@ -15,7 +15,13 @@ from kiln_schemas.gates import GateResult, Gates
 from kiln_schemas.settings import AUTO, BakeSettings
 from kiln_schemas.states import JobState, TaskState
 from kiln_schemas.tasks import Bundle, Progress, TaskKind
-from kiln_service.db.lenient import note_unreadable, readable, readable_or, readable_problem, readable_rows
+from kiln_service.db.lenient import (
+    note_unreadable,
+    readable,
+    readable_outcome,
+    readable_problem,
+    readable_rows,
+)
 
 C = TypeVar("C", bound=Contract)
 
@@ -129,9 +135,8 @@ class TaskRow(_Row):
             | {
                 "kind": TaskKind(values["kind"]),
                 "state": TaskState(values["state"]),
-                "progress": readable_or(Progress, values["progress"], None),
-                "error": readable_problem(values["error"]),
             }
+            | readable_outcome(values)
         )
 
 
