@@ -57,13 +57,13 @@ def s3_server(folder: Path) -> Iterator[seaweed.S3Server]:
         yield server
 
 
-@pytest.fixture(scope="session")
-def farm(session_folder: Path) -> Iterator[Farm]:
-    """A coordinator without workers."""
-    farm = Farm(session_folder / "farm")
-    farm.folder.mkdir()
-    try:
-        farm.start_coordinator()
-        yield farm
-    finally:
-        farm.stop()
+@pytest.fixture(scope="module")
+def farm() -> Iterator[Farm]:
+    """A coordinator without workers; one for each module, whose jobs reuse no light fields of another's."""
+    with tempfile.TemporaryDirectory(prefix="lightkiln-e2e-") as folder:
+        farm = Farm(Path(folder))
+        try:
+            farm.start_coordinator()
+            yield farm
+        finally:
+            farm.stop()
