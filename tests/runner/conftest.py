@@ -19,7 +19,7 @@ from kiln_schemas.settings import PRESETS, Function
 from kiln_schemas.tasks import Claim, FitPayload, TaskKind
 from kiln_workers.runner.parent import Worker, WorkerOptions
 
-TOKEN = "secret"
+TOKEN = "the-token-of-a-worker"
 STAGES = "stages_for_tests"
 
 

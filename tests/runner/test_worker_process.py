@@ -44,7 +44,7 @@ def test_a_worker_has_the_name_of_the_one_that_it_follows(coordinator, tmp_path:
     coordinator.refuse["claim"] = Drained("an operator told the worker to leave")
     command = [sys.executable, "-m", "kiln_workers", "worker", "--url", coordinator.url, "--scratch", str(tmp_path)]
     for _ in range(2):
-        environment = os.environ | {"LIGHTKILN_TOKEN": "secret"}
+        environment = os.environ | {"LIGHTKILN_TOKEN": "the-token-of-a-worker"}
         done = subprocess.run(command, timeout=120, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
     first, second = (registration["name"] for registration in coordinator.named("/workers"))

@@ -121,6 +121,8 @@ class KnownBake:
         images = self.images[at].reshape(64, *self.images.shape[2:])[inside]
         irradiance = np.tile(np.float32([3.0, 1.0, 0.2]), (len(inside), 1))
         self.store.write_tile(place, inside, images, None, irradiance)
+        half = images.shape[1] // 2
+        self.store.write_between(place, inside[:1], np.zeros((1, 3, half, half, 3), np.float16))
 
     def irradiance(self, row: int, column: int) -> np.ndarray:
         """[8, 8, 3] of a tile, as it is stored."""
@@ -176,7 +178,13 @@ def known_bake(home: Any) -> Callable[[str], KnownBake]:
         images[:8] = lit * (directions @ np.array([0.0, 0.6, 0.8]) > 0.0)[..., None]
         store_url = home.sql("SELECT store_url FROM jobs WHERE id = %s", job_id)[0]["store_url"]
         store = LightFieldStore.create(
-            store_url, shape=(32, 32), image_size=side, tile=8, functions=[Function.LIGHT_FIELD], attributes={}
+            store_url,
+            shape=(32, 32),
+            image_size=side,
+            tile=8,
+            functions=[Function.LIGHT_FIELD],
+            between=True,
+            attributes={},
         )
         bake = KnownBake(home, store, "", lobes, images.astype(np.float16), np.zeros((32, 32)))
         plain = np.zeros((32, 32), np.float32)

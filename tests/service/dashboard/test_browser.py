@@ -375,7 +375,11 @@ def test_workers_are_seen_and_told_and_stuck_tasks_stand_out(home, dashboard, sc
     expect(page.locator("#stuck")).to_contain_text("prepare scene")
     expect(page.locator("#stuck")).to_contain_text("6 min")
     home.sql("UPDATE workers SET tags = '{gpu,large}' WHERE id = %s", idle.id)
-    home.sql("INSERT INTO blocks VALUES ('node-2', %s, 'render', now() + interval '1 hour')", job)
+    home.sql(
+        "INSERT INTO blocks SELECT registrant, %s, 'render', now() + interval '1 hour' FROM workers WHERE id = %s",
+        job,
+        idle.id,
+    )
     expect(page.locator(f"#worker-{idle.id}")).to_contain_text("gpu large")
     expect(page.locator(f"#worker-{idle.id}")).to_contain_text("no render of a job until")
     assert axe(page) == []
