@@ -73,6 +73,11 @@ class Block(Contract):
     size: int = Field(ge=1, le=256)
 
 
+def tile_label(row: int, column: int) -> str:
+    """The label of the task that renders the tile with this first row and column."""
+    return f"tile {row},{column}"
+
+
 class Tile(Contract):
     """A square of the light map: first row and column, texels along each side, texels that have a surface point."""
 
@@ -84,7 +89,7 @@ class Tile(Contract):
     @property
     def label(self) -> str:
         """The label of the task that renders it."""
-        return f"tile {self.row},{self.column}"
+        return tile_label(self.row, self.column)
 
 
 class PreparePayload(Contract):

@@ -33,16 +33,17 @@ async def redo_damaged(tx: Tx, job: JobRow) -> Damaged | None:
         await tx.run("forget_checkpoints", ids=begin_again)
         await drop_blobs(tx, *(f"checkpoint:{task_id}" for task_id in begin_again))
         await add_event(tx, job.id, "checkpoints.lost", transitions.COORDINATOR, detail={"count": len(begin_again)})
-    lost = [(row["id"], TaskKind(row["kind"])) for row in rows if row["use"] == "result"]
+    lost = [row for row in rows if row["use"] == "result"]
     if lost:
-        await transitions.redo_lost(tx, job, lost, "blobs of their results are damaged")
+        kinds = {TaskKind(row["kind"]) for row in lost}
+        choice = transitions.Choice(ids=[row["id"] for row in lost])
+        await transitions.redo_lost(tx, job, kinds, choice, "blobs of their results are damaged")
     return await damaged_files(tx, job)
 
 
 async def damaged_files(tx: Tx, job: JobRow) -> Damaged | None:
     """The error of a locked job whose scene is still to be read and has a damaged file."""
-    (prepare,) = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[TaskKind.PREPARE])
-    if prepare["state"] == TaskState.COMPLETED:
+    if (await tx.one("prepare_state", job_id=job.id))["state"] == TaskState.COMPLETED:
         return None
     absent = set(await require_blobs(tx, job.bundle.files.values()))
     names = sorted(f"{path} ({sha256})" for path, sha256 in job.bundle.files.items() if sha256 in absent)

@@ -5,7 +5,6 @@ from collections.abc import Set
 from contextlib import nullcontext
 from typing import Final
 
-from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
 from kiln_schemas.errors import Conflict, InputError, NotFound
@@ -201,23 +200,17 @@ async def requeue(database: Database, config: ServiceConfig, job_id: str, wanted
         _require(job, LIVE_JOB_STATES | PUBLISHED_JOB_STATES | {JobState.FAILED}, "requeued")
         stages = METHODS[job.method].stages
         later = stages[stages.index(wanted.kind) + 1 :]
-        rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[wanted.kind.value])
-        chosen = [row["id"] for row in rows if _is_wanted(row, wanted)]
-        if not chosen:
-            raise InputError(
-                f"job {job_id} has {len(rows)} {wanted.kind} tasks, none of them in what was asked for",
-                where="requeue",
-                remedy="GET .../tasks lists them with their labels.",
-            )
-        redone = await transitions.redo_tasks(tx, job, chosen, TaskState.QUEUED)
-        if not redone and job.state is not JobState.FAILED:
+        choice = transitions.Choice(labels=wanted.labels, rows=wanted.rows, columns=wanted.columns)
+        redone = await transitions.redo_tasks(tx, job, [wanted.kind], TaskState.QUEUED, choice)
+        if not redone.chosen:
+            raise _chose_nothing(job, wanted.kind, redone.total)
+        if not redone.moved and job.state is not JobState.FAILED:
             raise Conflict(f"the {wanted.kind} tasks of job {job_id} are not done yet", where="job")
-        rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[kind.value for kind in later])
-        waiting = await transitions.redo_tasks(tx, job, [row["id"] for row in rows], TaskState.WAITING)
+        waiting = (await transitions.redo_tasks(tx, job, later, TaskState.WAITING)).moved
         await tx.run("delete_artifacts", job_id=job.id)
         if job.state not in LIVE_JOB_STATES:
             job = await restore(tx, config, job, found)
-        detail = wanted.model_dump(mode="json", exclude_none=True) | {"count": redone, "waiting": waiting}
+        detail = wanted.model_dump(mode="json", exclude_none=True) | {"count": redone.moved, "waiting": waiting}
         await add_event(tx, job.id, "tasks.requeued", actor, detail=detail)
         if job.state in PUBLISHED_JOB_STATES:
             await tx.run("set_gate_results", id=job.id, results=Jsonb([]))
@@ -230,15 +223,14 @@ async def requeue(database: Database, config: ServiceConfig, job_id: str, wanted
         await queue.announce(tx, [first])
 
 
-def _is_wanted(row: DictRow, wanted: RequeueRequest) -> bool:
-    """Whether a task is among those asked for, by its label and by the texels of its tile or block."""
-    if wanted.labels is not None and row["label"] not in wanted.labels:
-        return False
-    square = row["spec"].get("tile") or row["spec"].get("block")
-    if square is None:
-        return wanted.rows is None and wanted.columns is None
-    spans = ((wanted.rows, square["row"]), (wanted.columns, square["column"]))
-    return all(span is None or (span[0] < start + square["size"] and start < span[1]) for span, start in spans)
+def _chose_nothing(job: JobRow, kind: TaskKind, total: int) -> Conflict | InputError:
+    if not total:
+        return Conflict(f"job {job.id} has no {kind} tasks yet, so none can be requeued", where="job")
+    return InputError(
+        f"none of the {total} {kind} tasks of job {job.id} has the labels, rows and columns that were asked for",
+        where="requeue",
+        remedy="GET .../tasks lists them with their labels.",
+    )
 
 
 async def archive(database: Database, job_id: str, actor: str) -> None:

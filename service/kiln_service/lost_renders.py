@@ -5,16 +5,15 @@ that is gone as a whole is made anew by the prepare task; a job that read anothe
 Tiles are rendered again into the store that they were lost from: their bytes are the same whoever renders them.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from kiln_schemas.errors import StoreLost, TilesLost
-from kiln_schemas.states import TaskState
-from kiln_schemas.tasks import Failure, TaskKind
+from kiln_schemas.tasks import Failure, TaskKind, tile_label
 from kiln_service import transitions
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, JobRow, Tx
-from kiln_service.stores import Look, look, place_of
+from kiln_service.stores import Look, look
 
 
 @dataclass(frozen=True)
@@ -48,23 +47,16 @@ async def redo_seen(tx: Tx, config: ServiceConfig, job: JobRow, found: Look) -> 
     """Have a locked job render again what the coordinator has seen to be gone."""
     if found.whole:
         return job
-    rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[TaskKind.RENDER])
-    labels = [row["label"] for row in rows if place_of(row) in found.lost]
+    labels = [tile_label(row, column) for row, column in sorted(found.lost)]
     return await redo(tx, config, job, Lost(whole=found.gone, labels=labels))
 
 
 async def redo(tx: Tx, config: ServiceConfig, job: JobRow, lost: Lost) -> JobRow:
     """Have a locked job render again what is lost."""
-    kinds = [TaskKind.PREPARE, TaskKind.RENDER] if lost.whole else [TaskKind.RENDER]
-    rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[kind.value for kind in kinds])
-    chosen: Sequence[tuple[str, TaskKind]] = [
-        (row["id"], TaskKind(row["kind"]))
-        for row in rows
-        if row["state"] == TaskState.COMPLETED and (lost.whole or row["label"] in lost.labels)
-    ]
     if lost.whole and job.renders_of is not None:
         job = await transitions.render_into_own_store(tx, job, f"{config.store_base}/{job.id}.zarr")
-    if chosen:
-        what = "the light-field store is gone" if lost.whole else "tiles of the light-field store are gone or damaged"
-        await transitions.redo_lost(tx, job, chosen, what)
+    kinds = {TaskKind.PREPARE, TaskKind.RENDER} if lost.whole else {TaskKind.RENDER}
+    choice = transitions.Choice(labels=None if lost.whole else list(lost.labels))
+    what = "the light-field store is gone" if lost.whole else "tiles of the light-field store are gone or damaged"
+    await transitions.redo_lost(tx, job, kinds, choice, what)
     return job

@@ -13,8 +13,6 @@ import obstore
 from obstore.exceptions import BaseError
 
 from kiln_schemas.conventions import ARRAY_BETWEEN, ARRAY_IRRADIANCE, ARRAY_LIGHT_FIELD, ARRAY_VISIBILITY
-from kiln_schemas.states import TaskState
-from kiln_schemas.tasks import TaskKind
 from kiln_service.blobs import open_objects
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, JobRow
@@ -83,17 +81,10 @@ async def look(
 
 async def look_for_renders(config: ServiceConfig, database: Database, job: JobRow) -> Look:
     """Look for all that a job has rendered; a job that has rendered nothing yet misses nothing."""
-    async with database.transaction() as tx:
-        rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[TaskKind.RENDER])
-    done = [row for row in rows if row["state"] == TaskState.COMPLETED]
-    if not done or job.prepared is None:
+    places = await database.first("rendered_places", job_id=job.id)
+    if places is None or not places["rows"] or job.prepared is None:
         return Look(seen=False)
-    return await look(config, job.store_url, job, (place_of(row) for row in done))
-
-
-def place_of(row: Mapping[str, Any]) -> tuple[int, int]:
-    """First row and column of a render task's tile."""
-    return row["spec"]["tile"]["row"], row["spec"]["tile"]["column"]
+    return await look(config, job.store_url, job, zip(places["rows"], places["columns"], strict=True))
 
 
 def _arrays(job: JobRow) -> Sequence[str]:

@@ -227,11 +227,11 @@ async def reuse_renders(tx: Tx, job: JobRow, source: str, store_url: str) -> int
     """waiting > completed, all render tasks of a job whose light fields `source` has; how many."""
     check_task_move(TaskState.WAITING, TaskState.COMPLETED)
     await tx.run("share_renders", id=job.id, source=source, store_url=store_url)
-    rows = await tx.all(
+    count = await tx.count(
         "reuse_results", job_id=job.id, source=source, kind=TaskKind.RENDER, before=TaskState.WAITING.value
     )
-    await add_event(tx, job.id, "tasks.reused", COORDINATOR, detail={"count": len(rows), "job": source})
-    return len(rows)
+    await add_event(tx, job.id, "tasks.reused", COORDINATOR, detail={"count": count, "job": source})
+    return count
 
 
 async def resume_job(tx: Tx, job: JobRow, actor: str) -> JobRow:
@@ -249,42 +249,76 @@ async def reopen_tasks(tx: Tx, job: JobRow, stage: TaskKind, before: Sequence[Ta
         check_task_move(state, TaskState.QUEUED)
         check_task_move(state, TaskState.WAITING)
     states = [state.value for state in before]
-    rows = await tx.all("reopen_tasks", job_id=job.id, stage=stage.value, before=states)
-    await tx.run("forget_task_failures", ids=[row["id"] for row in rows])
+    count: int = (await tx.one("reopen_tasks", job_id=job.id, stage=stage.value, before=states))["moved"]
     await queue.announce(tx, [stage])
-    await add_event(tx, job.id, "tasks.reopened", actor, detail={"count": len(rows), "stage": stage.value})
-    return len(rows)
+    await add_event(tx, job.id, "tasks.reopened", actor, detail={"count": count, "stage": stage.value})
+    return count
 
 
-async def redo_tasks(tx: Tx, job: JobRow, ids: Sequence[str], after: TaskState) -> int:
-    """> queued or waiting, from any state but waiting and canceled: these tasks are done again; how many moved."""
-    apart = (TaskState.WAITING, TaskState.CANCELED)
-    before = [state for state in TaskState if after in TASK_TRANSITIONS[state] and state not in apart]
-    states = [state.value for state in before]
-    rows = await tx.all("redo_tasks", job_id=job.id, ids=list(ids), before=states, after=after)
-    moved = [row["id"] for row in rows]
-    await tx.run("forget_task_failures", ids=moved)
-    await drop_blobs(tx, *(f"{use}:{task_id}" for use in ("checkpoint", "result") for task_id in moved))
-    return len(moved)
+@dataclass(frozen=True)
+class Choice:
+    """Some of the tasks of a job: those that are in all that is given."""
+
+    ids: Sequence[str] | None = None
+    labels: Sequence[str] | None = None
+    rows: tuple[int, int] | None = None
+    """Texels of a tile or block: the first row, and the one after the last."""
+    columns: tuple[int, int] | None = None
 
 
-async def redo_lost(tx: Tx, job: JobRow, lost: Sequence[tuple[str, TaskKind]], reason: str) -> int:
-    """What these tasks (id, kind) of a locked job had made is gone: they are done again; how many.
+@dataclass(frozen=True)
+class Redone:
+    """How many tasks of some kinds there are, were chosen and are done again; the kinds of the last."""
+
+    total: int
+    chosen: int
+    moved: int
+    kinds: Sequence[TaskKind]
+
+
+async def redo_tasks(
+    tx: Tx,
+    job: JobRow,
+    kinds: Collection[TaskKind],
+    after: TaskState,
+    choice: Choice = Choice(),
+    before: Collection[TaskState] = frozenset(TaskState) - {TaskState.WAITING, TaskState.CANCELED},
+) -> Redone:
+    """> queued or waiting, from any of `before`: tasks are done again."""
+    states = [state.value for state in TaskState if state in before and after in TASK_TRANSITIONS[state]]
+    (row_start, row_stop), (column_start, column_stop) = choice.rows or (None, None), choice.columns or (None, None)
+    row = await tx.one(
+        "redo_tasks",
+        job_id=job.id,
+        kinds=[kind.value for kind in kinds],
+        ids=None if choice.ids is None else list(choice.ids),
+        labels=None if choice.labels is None else list(choice.labels),
+        row_start=row_start,
+        row_stop=row_stop,
+        column_start=column_start,
+        column_stop=column_stop,
+        before=states,
+        after=after,
+    )
+    return Redone(row["total"], row["chosen"], row["moved"], [TaskKind(kind) for kind in row["kinds"]])
+
+
+async def redo_lost(tx: Tx, job: JobRow, kinds: Collection[TaskKind], choice: Choice, reason: str) -> None:
+    """What completed tasks of a locked job had made is gone: they are done again.
 
     Tasks of later stages wait for them and keep their checkpoints: what is made again has the same bytes. Of those that
     completed, only what a network's weights led to is done again, as its bytes depend on the machine that trains it.
     """
+    redone = await redo_tasks(tx, job, kinds, TaskState.WAITING, choice, before=[TaskState.COMPLETED])
+    if not redone.moved:
+        return
     stages = METHODS[job.method].stages
-    first = min(stages.index(kind) for _, kind in lost)
-    later = stages[first + 1 :]
-    count = await redo_tasks(tx, job, [task_id for task_id, _ in lost], TaskState.WAITING)
+    first = min(stages.index(kind) for kind in redone.kinds)
     if stages[first] in (TaskKind.FIT, TaskKind.REFINE):
-        rows = await tx.all("tasks_of_kinds", job_id=job.id, kinds=[kind.value for kind in later])
-        await redo_tasks(tx, job, [row["id"] for row in rows], TaskState.WAITING)
+        await redo_tasks(tx, job, stages[first + 1 :], TaskState.WAITING)
     await hold_later(tx, job, stages[first])
-    await add_event(tx, job.id, "tasks.lost", COORDINATOR, detail={"count": count, "reason": reason})
+    await add_event(tx, job.id, "tasks.lost", COORDINATOR, detail={"count": redone.moved, "reason": reason})
     await release_first_stage(tx, job)
-    return count
 
 
 async def hold_later(tx: Tx, job: JobRow, stage: TaskKind) -> None:

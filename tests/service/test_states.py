@@ -24,7 +24,7 @@ def moves(row, job):
     problem = transitions.IllegalTransition("x").problem()
 
     async def claim(tx):
-        if (await transitions.claim_next(tx, job.id, [(worker, [row.kind])], 1))[1] == [None]:
+        if (await transitions.claim_next(tx, job.id, [(worker, [row.kind])], ["0" * 64], 1.0))[1] == [None]:
             raise IllegalTransition("there was nothing to claim")
 
     return {

@@ -71,22 +71,52 @@ WHERE job_id = %(job_id)s AND state = ANY(%(before)s)
 RETURNING id, checkpoint;
 
 -- name: reopen_tasks
--- failed, canceled > queued in the stage that the job has come to, > waiting in later ones.
-UPDATE tasks
-SET state = CASE WHEN kind = %(stage)s THEN 'queued' ELSE 'waiting' END,
-    strikes = 0, error = NULL, progress = NULL, worker_id = NULL, checkpoint = NULL,
-    started = NULL, finished = NULL, heartbeat = NULL
-WHERE job_id = %(job_id)s AND state = ANY(%(before)s)
-RETURNING id;
+-- failed, canceled > queued in the stage that the job has come to, > waiting in later ones; how many.
+WITH moved AS (
+    UPDATE tasks
+    SET state = CASE WHEN kind = %(stage)s THEN 'queued' ELSE 'waiting' END,
+        strikes = 0, error = NULL, progress = NULL, worker_id = NULL, checkpoint = NULL,
+        started = NULL, finished = NULL, heartbeat = NULL
+    WHERE job_id = %(job_id)s AND state = ANY(%(before)s)
+    RETURNING id
+), forgotten AS (
+    DELETE FROM failures USING moved WHERE failures.task_id = moved.id
+)
+SELECT count(*) AS moved FROM moved;
 
 -- name: redo_tasks
--- > queued, waiting: tasks of a job are to be done again, whatever became of them.
-UPDATE tasks
-SET state = %(after)s, result = NULL,
-    strikes = 0, error = NULL, progress = NULL, worker_id = NULL, checkpoint = NULL,
-    started = NULL, finished = NULL, heartbeat = NULL
-WHERE job_id = %(job_id)s AND id = ANY(%(ids)s) AND state = ANY(%(before)s)
-RETURNING id;
+-- > queued, waiting: tasks of some kinds of a job are to be done again, whatever became of them. A choice that is NULL
+-- leaves none out; rows and columns choose tasks whose tile or block has texels from a start to before a stop. How many
+-- tasks of the kinds there are, how many were chosen, how many of these were in a state to be done again; their kinds.
+WITH present AS (
+    SELECT id, label, COALESCE(spec -> 'tile', spec -> 'block') AS square FROM tasks
+    WHERE job_id = %(job_id)s AND kind = ANY(%(kinds)s)
+), chosen AS (
+    SELECT id FROM present
+    WHERE (%(ids)s::text[] IS NULL OR id = ANY(%(ids)s))
+      AND (%(labels)s::text[] IS NULL OR label = ANY(%(labels)s))
+      AND (%(row_start)s::int8 IS NULL OR (square ->> 'row')::int8 < %(row_stop)s
+           AND (square ->> 'row')::int8 + (square ->> 'size')::int8 > %(row_start)s)
+      AND (%(column_start)s::int8 IS NULL OR (square ->> 'column')::int8 < %(column_stop)s
+           AND (square ->> 'column')::int8 + (square ->> 'size')::int8 > %(column_start)s)
+), moved AS (
+    UPDATE tasks
+    SET state = %(after)s, result = NULL,
+        strikes = 0, error = NULL, progress = NULL, worker_id = NULL, checkpoint = NULL,
+        started = NULL, finished = NULL, heartbeat = NULL
+    FROM chosen
+    WHERE tasks.job_id = %(job_id)s AND tasks.id = chosen.id AND tasks.state = ANY(%(before)s)
+    RETURNING tasks.id, tasks.kind
+), forgotten AS (
+    DELETE FROM failures USING moved WHERE failures.task_id = moved.id
+), dropped AS (
+    DELETE FROM blob_uses
+    WHERE owner IN (SELECT use || ':' || id FROM moved CROSS JOIN unnest(ARRAY['checkpoint', 'result']) AS use)
+)
+SELECT (SELECT count(*) FROM present) AS total,
+       (SELECT count(*) FROM chosen) AS chosen,
+       (SELECT count(*) FROM moved) AS moved,
+       ARRAY(SELECT DISTINCT kind FROM moved) AS kinds;
 
 -- name: hold_tasks
 -- queued, soft-failed, active > waiting: tasks of some kinds of a job, which keep their checkpoints.
@@ -121,5 +151,4 @@ UPDATE tasks
 SET state = 'completed', result = done.result, started = now(), finished = now()
 FROM tasks AS done
 WHERE tasks.job_id = %(job_id)s AND tasks.kind = %(kind)s AND tasks.state = %(before)s
-  AND done.job_id = %(source)s AND done.kind = tasks.kind AND done.label = tasks.label AND done.state = 'completed'
-RETURNING tasks.id;
+  AND done.job_id = %(source)s AND done.kind = tasks.kind AND done.label = tasks.label AND done.state = 'completed';

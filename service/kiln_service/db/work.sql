@@ -36,9 +36,15 @@ SELECT EXISTS (
     ORDER BY finished LIMIT 1
 ) AS stuck;
 
--- name: tasks_of_kinds
--- Tasks of some kinds of a job, in the order of planning.
-SELECT id, kind, label, state, spec FROM tasks WHERE job_id = %(job_id)s AND kind = ANY(%(kinds)s) ORDER BY ordinal;
+-- name: prepare_state
+-- How far a job's prepare task is.
+SELECT state FROM tasks WHERE job_id = %(job_id)s AND kind = 'prepare';
+
+-- name: rendered_places
+-- First rows and columns of the tiles that a job has rendered: two arrays, which are read far faster than rows.
+SELECT array_agg((spec -> 'tile' ->> 'row')::int ORDER BY ordinal) AS rows,
+       array_agg((spec -> 'tile' ->> 'column')::int ORDER BY ordinal) AS columns
+FROM tasks WHERE job_id = %(job_id)s AND kind = 'render' AND state = 'completed';
 
 -- name: failed_share
 -- Of a job's tasks of a kind: how many there are, have failed, have completed; how many of the job can still be worked
