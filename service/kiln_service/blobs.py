@@ -6,9 +6,10 @@ folder that names it; obstore does neither), so an object without a row is nothi
 same blob exclude each other by an advisory lock on its hash.
 
 A disk may damage or lose an object later. Whole blobs are hashed again while they are sent, parts are checked by the
-object's size. A blob that is found damaged is marked: nobody is told any more that it is here, so whoever has the bytes
-uploads them again, and an upload always replaces the object. `on_damage` tells those who can make the bytes again
-(`kiln_service.damage`).
+object's size. Who asks whether a blob is here learns of damage too: it is hashed again unless it was read whole within
+the last hour and not written since. A blob that is found damaged is marked: nobody is told any more that it is here, so
+whoever has the bytes uploads them again, and an upload always replaces the object. `on_damage` tells those who can make
+the bytes again (`kiln_service.damage`).
 """
 
 import asyncio
@@ -17,7 +18,8 @@ import hashlib
 import logging
 import os
 import tempfile
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Sequence
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Final
@@ -45,6 +47,12 @@ WRITE_BYTES: Final = 2**20
 READ_BYTES: Final = 2**20
 READ_GAP: Final = 2**16
 """Parts of a blob that lie closer are read at once."""
+WHOLE_S: Final = 3600.0
+"""So long a blob that was read whole is believed to be whole still."""
+WHOLE_BLOBS: Final = 2**16
+"""Of so many blobs it is kept in mind when they were read whole."""
+EXAMINED_BYTES: Final = 2**30
+"""At most so much is read for one question; of more, the smallest blobs are."""
 
 
 RETRIES: Final["RetryConfig"] = {"max_retries": 4, "retry_timeout": timedelta(seconds=20)}
@@ -82,6 +90,7 @@ class Blobs:
         for folder in filter(None, (self._incoming, self._folder)):
             folder.mkdir(parents=True, exist_ok=True)
         self._objects: ObjectStore = open_objects(url)
+        self._found_whole: dict[str, tuple[str | None, float]] = {}
 
     async def receive(self, sha256: str, body: AsyncIterator[bytes], length: int | None, token: str) -> int:
         """Take an upload whole or not at all; its size in bytes. `length` is the announced Content-Length.
@@ -115,11 +124,39 @@ class Blobs:
         return size
 
     async def missing(self, hashes: Iterable[str]) -> list[str]:
-        """Those that are not here, in the order given; those that are here are kept for the grace period."""
+        """Those that are not here or damaged, in the order given; the others are kept for the grace period."""
         wanted = list(dict.fromkeys(hashes))
         async with self._database.transaction() as tx:
-            here = {row["sha256"] for row in await tx.all("touch_blobs", hashes=wanted)}
-        return [sha256 for sha256 in wanted if sha256 not in here]
+            here = {row["sha256"]: int(row["size"]) for row in await tx.all("touch_blobs", hashes=wanted)}
+        whole = here.keys() - await self._damaged_of(here)
+        return [sha256 for sha256 in wanted if sha256 not in whole]
+
+    async def _damaged_of(self, sizes: Mapping[str, int]) -> set[str]:
+        """Those of some blobs that are damaged, of at most `EXAMINED_BYTES`: the smallest that were not read lately."""
+        damaged: set[str] = set()
+        left = EXAMINED_BYTES
+        for sha256, size in sorted(sizes.items(), key=lambda item: item[1]):
+            if await self._was_whole(sha256):
+                continue
+            left -= size
+            if left < 0:
+                break
+            try:
+                await self._doubt(sha256)
+            except Damaged:
+                damaged.add(sha256)
+        return damaged
+
+    async def _was_whole(self, sha256: str) -> bool:
+        """Whether the object was read whole within the last hour and not written since."""
+        version, when = self._found_whole.get(sha256, (None, 0.0))
+        return version is not None and time.monotonic() - when < WHOLE_S and await self._version(sha256) == version
+
+    def _note_whole(self, sha256: str, version: str | None) -> None:
+        self._found_whole.pop(sha256, None)
+        self._found_whole[sha256] = version, time.monotonic()
+        if len(self._found_whole) > WHOLE_BLOBS:
+            del self._found_whole[next(iter(self._found_whole))]
 
     async def size(self, sha256: str) -> int:
         """Bytes of a blob; NotFound where it is not here, Damaged where its bytes are known to be damaged."""
@@ -173,6 +210,7 @@ class Blobs:
         if digest.hexdigest() != sha256:
             await self._doubt(sha256)
             raise Unreachable(f"blob {sha256} was read wrong once", where="storage")
+        self._note_whole(sha256, result.meta["e_tag"])
         yield held
 
     async def _doubt(self, sha256: str) -> None:
@@ -182,7 +220,9 @@ class Blobs:
         """
         bad, version = await self._examine(sha256)
         if not bad:
+            self._note_whole(sha256, version)
             return
+        self._found_whole.pop(sha256, None)
         async with self._database.transaction() as tx:
             await tx.run("lock_blob", sha256=sha256)
             if await self._version(sha256) != version:

@@ -95,6 +95,21 @@ def test_damaged_bytes_are_never_whole_and_an_upload_replaces_them(place, how):
     assert home.client.post("/v1/blobs/missing", json={"sha256": [SHA256]}).json() == {"missing": []}
 
 
+@pytest.mark.parametrize("how", HOW)
+def test_who_asks_whether_a_damaged_blob_is_here_is_told_no(place, how):
+    """Though nobody has read it since, and whoever had it first has long gone."""
+    home = place.home
+    home.upload(DATA)
+    assert home.client.post("/v1/blobs/missing", json={"sha256": [SHA256]}).json() == {"missing": []}
+    place.damage(SHA256, how)
+    assert home.client.post("/v1/blobs/missing", json={"sha256": [SHA256]}).json() == {"missing": [SHA256]}
+    home.upload(DATA)
+    place.damage(SHA256, how)
+    assert home.client.head(f"/v1/blobs/{SHA256}").status_code == 404
+    home.upload(DATA)
+    assert home.client.head(f"/v1/blobs/{SHA256}").status_code == 200
+
+
 def test_an_upload_replaces_damage_that_nobody_has_found(place):
     place.home.upload(DATA)
     place.damage(SHA256, flipped)

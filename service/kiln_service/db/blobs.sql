@@ -5,11 +5,11 @@
 SELECT pg_advisory_xact_lock(hashtextextended(%(sha256)s, 0));
 
 -- name: touch_blobs
--- Which blobs are here and whole; each is kept for the grace period from now.
+-- Which blobs are here and not known to be damaged, with their sizes; each is kept for the grace period from now.
 WITH here AS (
     SELECT sha256 FROM blobs WHERE sha256 = ANY(%(hashes)s) AND damaged IS NULL ORDER BY sha256 FOR NO KEY UPDATE
 )
-UPDATE blobs SET touched = now() FROM here WHERE blobs.sha256 = here.sha256 RETURNING blobs.sha256;
+UPDATE blobs SET touched = now() FROM here WHERE blobs.sha256 = here.sha256 RETURNING blobs.sha256, blobs.size;
 
 -- name: hold_blobs
 -- Which blobs are here and whole, with their sizes; none is collected before the transaction ends.
