@@ -166,7 +166,7 @@ class PackageSettings(Contract):
         default=128,
         ge=16,
         le=1024,
-        description="side of the GGX cube's largest mip; environment.exr is 8 times as wide at most",
+        description="side of the GGX cube's largest mip",
     )
     supercompress: bool = Field(default=True, description="Zstandard inside the lobe textures")
 

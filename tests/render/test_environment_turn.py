@@ -57,7 +57,7 @@ def test_every_user_of_the_environment_sees_the_sun_there(row, column, rotation,
     fine = cube_directions(64)
     found["look-up"] = towards(fine, look_up(environment, fine))
     found["cube"] = towards(cube_directions(32), ggx_prefilter(environment, 32, 2, "cpu")[0])
-    picture = panorama(environment, WIDTH)
+    picture = panorama(environment)
     grid = np.array([[direction_of(i, j) for j in range(WIDTH)] for i in range(HEIGHT)])
     found["panorama"] = towards(grid, picture)
     world = to_mitsuba(Scene((quad((0, -9, 0), (0, 0, 1), (1, 0, 0)),), (Material("a"),), environment=environment))

@@ -70,7 +70,11 @@ def manifest(environment: bool) -> Manifest:
     integrals = [4.0 / (1.0 + alpha**2) for alpha in U_ALPHAS]
     u = {"alphas": list(U_ALPHAS), "lobe_integrals": integrals, "normalised": False}
     lobes = {name: {"lobes": 3} for name in (conventions.LIGHT_FIELD_KTX2, conventions.VISIBILITY_KTX2)}
-    maps = {**lobes, conventions.ENVIRONMENT_U_KTX2: u} if environment else {conventions.LIGHT_FIELD_KTX2: {}}
+    maps = (
+        {**lobes, conventions.ENVIRONMENT_U_KTX2: u, conventions.ENVIRONMENT_EXR: {}}
+        if environment
+        else {conventions.LIGHT_FIELD_KTX2: {}}
+    )
     return Manifest(
         format_version=conventions.FORMAT_VERSION,
         generator="test",
@@ -98,13 +102,13 @@ def package(*, constant: bool = False, environment: bool = False) -> ShadePackag
     lobes = torch.from_numpy(lobe_map(constant))
     integrals = torch.tensor([4.0 / (1.0 + alpha**2) for alpha in U_ALPHAS])
     u = integrals[:, None, None, None].expand(len(U_ALPHAS), 8, 8, 3).clone()
-    cube = torch.arange(6, dtype=torch.float32)[:, None, None, None].expand(6, 4, 4, 3).clone()
+    itself = torch.arange(4 * 8 * 3, dtype=torch.float32).reshape(4, 8, 3)
     return ShadePackage(
         manifest=manifest(environment),
         scene=room(),
         irradiance=torch.full((SIZE, SIZE, 3), torch.pi),
         lobes=LobeTextures(lobes, lobes if environment else None),
-        environment=EnvironmentLookup(u, torch.tensor(U_ALPHAS), cube) if environment else None,
+        environment=EnvironmentLookup(u, torch.tensor(U_ALPHAS), itself) if environment else None,
     )
 
 
@@ -137,8 +141,7 @@ def package_folder(tmp_path: Path) -> Path:
         ktx2.write(folder / name, ktx2.texture_array(layers, {}))
     u, _ = to_half(np.concatenate([made.environment.u.numpy(), np.ones((4, 8, 8, 1))], axis=-1))
     ktx2.write(folder / conventions.ENVIRONMENT_U_KTX2, ktx2.texture_array(u, {}))
-    cube, _ = to_half(np.concatenate([made.environment.mirror.numpy(), np.ones((6, 4, 4, 1))], axis=-1))
-    ktx2.write(folder / conventions.ENVIRONMENT_GGX_KTX2, ktx2.texture_cube([cube], {}))
+    exr.write_rgb(folder / conventions.ENVIRONMENT_EXR, made.environment.itself.numpy())
     exr.write_rgb(folder / conventions.IRRADIANCE_EXR, made.irradiance.numpy())
     (folder / conventions.SCENE_GLB).write_bytes(encode_glb(made.scene))
     (folder / conventions.MANIFEST_JSON).write_text(made.manifest.model_dump_json())

@@ -48,7 +48,7 @@ def test_a_package_is_read_as_it_was_made(package_folder: Path, make_package) ->
     torch.testing.assert_close(read.irradiance, made.irradiance)
     torch.testing.assert_close(read.lobes.light_field, made.lobes.light_field, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(read.environment.u, made.environment.u, rtol=1e-3, atol=0.0)
-    torch.testing.assert_close(read.environment.mirror, made.environment.mirror)
+    torch.testing.assert_close(read.environment.itself, made.environment.itself)
     for ours, theirs in zip(read.scene.meshes, made.scene.meshes, strict=True):
         assert ours.lightmap_uv is not None and theirs.lightmap_uv is not None
         np.testing.assert_array_equal(ours.lightmap_uv[ours.faces], theirs.lightmap_uv[theirs.faces])

@@ -1,6 +1,7 @@
 """Look-ups against slow loops and against the maps' own pixel directions."""
 
 import numpy as np
+import pytest
 import torch
 
 from kiln_workers.render.environment import cube_directions, environment_samples, environment_u
@@ -92,3 +93,20 @@ def test_material_textures_wrap_and_transform() -> None:
     np.testing.assert_allclose(mirrored, [1.0, 0.0, 0.0, 1.0], atol=1e-9)
     moved = TextureRef(0, offset=(0.25, 0.5), scale=(0.5, 1.0))
     np.testing.assert_allclose(material.look_up(image, moved, np.array([[0.25, 0.75]]))[0, :3], (1.0, 0.5, 0.25))
+
+
+def test_an_equirectangular_image_is_seen_where_it_says() -> None:
+    """Row 0 is +Y, the middle column +X, right of it +Z; left and right edges meet."""
+    directions = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    columns = torch.arange(8.0)[None, :, None].expand(4, 8, 1)
+    assert textures.equirectangular(columns, directions[:3])[:, 0].tolist() == pytest.approx([3.5, 5.5, 1.5], abs=1e-5)
+    assert textures.equirectangular(columns, directions[3:4]).item() == pytest.approx(3.5, abs=1e-5)  # of 7 and 0
+    rows = torch.arange(4.0)[:, None, None].expand(4, 8, 1)
+    assert textures.equirectangular(rows, directions[[0, 4]])[:, 0].tolist() == pytest.approx([1.5, 0.0], abs=1e-5)
+
+
+def test_an_unrolled_cube_is_the_cube() -> None:
+    smooth = torch.tensor(cube_directions(64), dtype=torch.float32)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+    seen = textures.equirectangular(textures.unrolled(smooth), directions)
+    assert (torch.nn.functional.normalize(seen, dim=-1) - directions).abs().max() < 0.02

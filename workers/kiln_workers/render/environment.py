@@ -13,7 +13,6 @@ import numpy.typing as npt
 from kiln_workers.render import lobes
 from kiln_workers.render.backend import Device, select_variant
 from kiln_workers.render.jit import dr, mi
-from kiln_workers.scene.environment import averaged_down
 from kiln_workers.scene.model import Environment, Float32
 from kiln_workers.sphere import octahedral
 
@@ -147,11 +146,9 @@ def look_up(environment: Environment, directions: Floats) -> Floats:
     return np.asarray((upper * (1.0 - down) + lower * down) * environment.scale, dtype=np.float64)
 
 
-def panorama(environment: Environment, widest: int) -> Float32:
-    """The scaled environment [H, W, 3] with its rotation applied to the pixels, averaged down to `widest` columns."""
+def panorama(environment: Environment) -> Float32:
+    """The scaled environment [H, W, 3] with its rotation applied to the pixels."""
     pixels = environment.pixels
-    if pixels.shape[1] > widest:
-        pixels = averaged_down(pixels, widest)
     shift = pixels.shape[1] * environment.rotation_deg / 360.0
     whole = int(np.floor(shift))
     near = np.roll(pixels.astype(np.float64), -whole, axis=1)

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from kiln_schemas.conventions import (
+    ENVIRONMENT_EXR,
     ENVIRONMENT_GGX_KTX2,
     ENVIRONMENT_U_KTX2,
     FORMAT_VERSION,
@@ -43,6 +44,7 @@ Float32 = npt.NDArray[np.float32]
 MOST_PIXELS: Final = 2**27
 MOST_CHANNELS: Final = 16
 MOST_U_LAYERS: Final = 64
+MOST_ENVIRONMENT_PIXELS: Final = 2**23
 CUBE_SIDES: Final = 8
 """Six, and all their mips."""
 
@@ -85,7 +87,7 @@ class EnvironmentLookup:
 
     u: Tensor  # [A, R, R, 3] octahedral maps of U, not normalised
     alphas: Tensor  # [A] ascending
-    mirror: Tensor  # [6, S, S, 3] the sharpest mip of the cube map
+    itself: Tensor  # [H, W, 3] equirectangular
 
     def convolved(self, directions: Tensor, alpha: Tensor) -> Tensor:
         """U(direction, alpha) [P, 3]: linear in the logarithms of U and alpha between the layers that enclose it."""
@@ -104,8 +106,8 @@ class EnvironmentLookup:
         return torch.exp2(torch.lerp(ends[0], ends[1], share))
 
     def seen(self, directions: Tensor) -> Tensor:
-        """The environment itself [P, 3] in directions [P, 3], as sharp as the package holds it."""
-        return textures.cube(self.mirror, directions)
+        """The environment itself [P, 3] in directions [P, 3]."""
+        return textures.equirectangular(self.itself, directions)
 
 
 @dataclass(frozen=True)
@@ -211,9 +213,13 @@ def _environment(folder: Path, manifest: Manifest, device: torch.device) -> Envi
     layers = ktx2.read(folder / ENVIRONMENT_U_KTX2, MOST_U_LAYERS * size).levels[0][:, 0, ..., :3].astype(np.float32)
     if described["normalised"]:
         layers = layers * np.asarray(described["lobe_integrals"], np.float32)[:, None, None, None]
-    cube = ktx2.read(folder / ENVIRONMENT_GGX_KTX2, CUBE_SIDES * size).levels[0][0, ..., :3].astype(np.float32)
+    if ENVIRONMENT_EXR in manifest.textures:
+        itself = torch.from_numpy(read_exr(folder / ENVIRONMENT_EXR, MOST_ENVIRONMENT_PIXELS))
+    else:
+        cube = ktx2.read(folder / ENVIRONMENT_GGX_KTX2, CUBE_SIDES * size).levels[0][0, ..., :3].astype(np.float32)
+        itself = textures.unrolled(torch.from_numpy(cube))
     return EnvironmentLookup(
         torch.from_numpy(layers).to(device),
         torch.tensor(described["alphas"], dtype=torch.float32, device=device),
-        torch.from_numpy(cube).to(device),
+        itself.to(device),
     )

@@ -40,6 +40,29 @@ def octahedral_uv(directions: Tensor) -> Tensor:
     return 0.5 + 0.5 * torch.where(p[:, 2:] < 0.0, folded, xy)
 
 
+def equirectangular(image: Tensor, directions: Tensor) -> Tensor:
+    """Values [P, C] of an equirectangular image [H, W, C] in directions [P, 3]: the top row is +Y, the middle column
+    +X, right of it lies +Z, the last column is followed by the first (docs/package.md)."""
+    x, y, z = (directions / directions.norm(dim=-1, keepdim=True)).unbind(-1)
+    wrapped = torch.cat([image[:, -1:], image, image[:, :1]], dim=1)
+    width = image.shape[1]
+    u = 0.5 + torch.atan2(z, x) / (2.0 * torch.pi)
+    v = 0.5 - torch.asin(y.clamp(-1.0, 1.0)) / torch.pi
+    return bilinear(wrapped, torch.stack([(u * width + 1.0) / (width + 2.0), v], dim=-1))
+
+
+def unrolled(faces: Tensor) -> Tensor:
+    """A cube map [6, S, S, C] as an equirectangular image [2 S, 4 S, C], for packages without environment.exr."""
+    height, width = 2 * faces.shape[1], 4 * faces.shape[1]
+    polar = torch.pi * (torch.arange(height) + 0.5)[:, None] / height
+    along = 2.0 * torch.pi * ((torch.arange(width) + 0.5) / width - 0.5)
+    directions = torch.stack(
+        [torch.sin(polar) * torch.cos(along), torch.cos(polar).expand(-1, width), torch.sin(polar) * torch.sin(along)],
+        dim=-1,
+    )
+    return cube(faces, directions.reshape(-1, 3)).reshape(height, width, -1)
+
+
 def cube(faces: Tensor, directions: Tensor) -> Tensor:
     """Values [P, C] of a cube map [6, S, S, C] in directions [P, 3]; bilinear inside a face."""
     size = directions.abs()

@@ -46,10 +46,6 @@ U_ROUGHNESS: Final = np.linspace(0.1, 1.0, 10)
 LEAST_MIP: Final = 4
 """Side of the GGX cube's smallest mip."""
 
-PANORAMA_SIDES: Final = 8
-"""Columns of environment.exr, at most, in sides of the GGX cube's largest mip: twice what goes around the cube, because
-engines show it behind the scene."""
-
 TEXELS_AT_ONCE: Final = 256
 
 LIBRARIES: Final = ("mitsuba", "drjit", "torch", "numpy", "tensorstore", "OpenEXR", "OpenImageIO", "uvunwrap")
@@ -207,7 +203,7 @@ def _convolve(environment: Environment, settings: PackageSettings) -> Environmen
     alphas = U_ROUGHNESS**2
     layers, integrals = environment_u(environment, alphas, size)
     return EnvironmentTextures(
-        panorama=panorama(environment, PANORAMA_SIDES * size),
+        panorama=panorama(environment),
         ggx_mips=ggx_prefilter(environment, size, mips),
         u_layers=layers,
         u_alphas=alphas.tolist(),

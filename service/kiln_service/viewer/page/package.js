@@ -1,39 +1,44 @@
 // A package as three.js objects: scene, textures, shaders, manifest; read from the URL of its folder.
 
 import * as THREE from "../vendor/three/three.module.min.js";
+import { EXRLoader } from "../vendor/three/EXRLoader.js";
 import { GLTFLoader } from "../vendor/three/GLTFLoader.js";
 
 const SHADERS = ["sg.glsl", "environment.glsl", "lightkiln.glsl", "surface.vert.glsl", "surface.frag.glsl"];
 const TEXTURES = ["lightfield.ktx2", "visibility.ktx2", "irradiance.ktx2", "environment_u.ktx2", "environment_ggx.ktx2"];
+const ENVIRONMENT = "environment.exr"; // packages made before 2026-11 may lack it
+const LARGEST_ENVIRONMENT = 4096; // columns
 const FORMAT_VERSION = 1;
 const LARGEST_SIDE = 8192; // texels, of kiln_schemas.settings
 
 // What can be wrong with a package, in a sentence for people.
 export class PackageError extends Error {}
 
-// { manifest, meshes, textures: {name: THREE.Texture}, shaders: {name: text}, bytes }
+// { manifest, meshes, environment, textures: {name: THREE.Texture}, shaders: {name: text}, bytes }
 export async function openPackage(folder, told = () => {}) {
   const manifest = await (await get(folder, "manifest.json")).json();
   if (manifest.format_version > FORMAT_VERSION) {
     throw new PackageError(`The package has format version ${manifest.format_version}; this viewer reads ${FORMAT_VERSION}. Update lightkiln.`);
   }
   const names = TEXTURES.filter((name) => name in manifest.textures);
-  const parts = names.length + SHADERS.length + 1;
+  const parts = names.length + SHADERS.length + 2;
   let done = 0;
   const part = async (promise) => {
     const value = await promise;
     told((done += 1) / parts);
     return value;
   };
-  const [glb, textures, ...shaders] = await Promise.all([
+  const [glb, environment, textures, ...shaders] = await Promise.all([
     part(get(folder, "scene.glb").then((response) => response.arrayBuffer())),
+    part(readEnvironment(folder, manifest)),
     readTextures(folder, names, manifest, part),
     ...SHADERS.map((name) => part(get(folder, `shaders/${name}`).then((response) => response.text()))),
   ]);
-  const bytes = glb.byteLength + Object.values(textures).reduce((sum, texture) => sum + texture.fileBytes, 0);
+  const bytes = glb.byteLength + (environment?.fileBytes ?? 0) + Object.values(textures).reduce((sum, texture) => sum + texture.fileBytes, 0);
   return {
     manifest,
     bytes,
+    environment,
     ...(await readMeshes(glb)),
     textures: Object.fromEntries(Object.entries(textures).map(([name, texture]) => [name, upload(texture, name)])),
     shaders: Object.fromEntries(SHADERS.map((name, index) => [name, shaders[index]])),
@@ -44,6 +49,27 @@ async function get(folder, name) {
   const response = await fetch(folder + name);
   if (!response.ok) throw new PackageError(`${name} cannot be read: the server answered ${response.status}.`);
   return response;
+}
+
+// The environment as it was given, an equirectangular texture whose middle column is +X; null without one.
+async function readEnvironment(folder, { textures }) {
+  if (!(ENVIRONMENT in textures)) return null;
+  const { width, height } = textures[ENVIRONMENT];
+  if (!(width <= LARGEST_ENVIRONMENT && height <= LARGEST_ENVIRONMENT)) {
+    throw new PackageError(`${ENVIRONMENT} has ${width} x ${height} pixels; at most ${LARGEST_ENVIRONMENT} columns are read.`);
+  }
+  const file = await (await get(folder, ENVIRONMENT)).arrayBuffer();
+  let image;
+  try {
+    image = new EXRLoader().parse(file);
+  } catch (error) {
+    throw new PackageError(`${ENVIRONMENT} cannot be read: ${error.message}.`);
+  }
+  const texture = half(new THREE.DataTexture(image.data, image.width, image.height));
+  texture.wrapS = THREE.RepeatWrapping;
+  texture.minFilter = THREE.LinearFilter;
+  texture.fileBytes = file.byteLength;
+  return texture;
 }
 
 // Decoded textures by name, read and decoded in one worker.

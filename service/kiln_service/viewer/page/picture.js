@@ -16,16 +16,19 @@ void main() {
 }
 `;
 
-// What `lightkiln shade` draws behind the scene: the sharpest mip of the cube map.
+// What `lightkiln shade` draws behind the scene: the environment itself; its texture's first row is the lowest.
 const BACKGROUND = `${PRECISION}
-uniform samplerCube uEnvironment;
+const float PI = 3.141592653589793;
+uniform sampler2D uEnvironment;
 uniform mat4 uToWorld;
 uniform vec3 uEye;
 in vec2 vClip;
 out vec4 radiance;
 void main() {
   vec4 far = uToWorld * vec4(vClip, 1.0, 1.0);
-  radiance = vec4(textureLod(uEnvironment, far.xyz / far.w - uEye, 0.0).rgb, 1.0);
+  vec3 towards = normalize(far.xyz / far.w - uEye);
+  vec2 at = vec2(0.5 + 0.5 * atan(towards.z, towards.x) / PI, 0.5 + asin(clamp(towards.y, -1.0, 1.0)) / PI);
+  radiance = vec4(textureLod(uEnvironment, at, 0.0).rgb, 1.0);
 }
 `;
 
@@ -106,7 +109,7 @@ export class Picture {
     this.at = null; // [u, v] of the light map whose light field is shown
     this.film = null;
     this.sky = fullScreen(BACKGROUND, {
-      uEnvironment: { value: opened.textures["environment_ggx.ktx2"] ?? null },
+      uEnvironment: { value: opened.environment },
       uToWorld: { value: new THREE.Matrix4() },
       uEye: this.shared.uEye,
     });
@@ -244,7 +247,7 @@ export class Picture {
     renderer.setRenderTarget(target);
     renderer.setClearColor(0x000000, 0);
     renderer.clear();
-    if (this.background && this.hasEnvironment) {
+    if (this.background && this.opened.environment) {
       this.sky.material.uniforms.uToWorld.value.copy(shared.uViewProjection.value).invert();
       renderer.render(this.sky, camera);
     }
