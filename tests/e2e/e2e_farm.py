@@ -74,7 +74,7 @@ def sky() -> np.ndarray[Any, np.dtype[np.float32]]:
     return pixels
 
 
-def lightkiln(*arguments: str | Path, timeout: float = 240) -> "subprocess.CompletedProcess[str]":
+def lightkiln(*arguments: str | Path, timeout: float = 1800) -> "subprocess.CompletedProcess[str]":
     """Run the command to its end."""
     command = [Path(sys.executable).with_name("lightkiln"), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL)
@@ -85,7 +85,7 @@ def settings(*overrides: str) -> list[str]:
     return [word for override in (*TINY, *overrides) for word in ("--set", override)]
 
 
-def wait_until(what: str, check: Callable[[], Any], timeout: float = 180.0) -> Any:
+def wait_until(what: str, check: Callable[[], Any], timeout: float = 1200.0) -> Any:
     """The first truthy answer of `check`; fails the test after `timeout` seconds."""
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
@@ -175,7 +175,7 @@ class Farm:
     def finish(self, job: str) -> None:
         """Wait until the job has completed."""
         over = ("completed", "gate-failed", "failed", "canceled")
-        state = wait_until("the job ends", lambda: (now := self.state(job)) in over and now, 300)
+        state = wait_until("the job ends", lambda: (now := self.state(job)) in over and now)
         assert state == "completed", self.get(f"/v1/jobs/{job}")
 
     def download(self, job: str, out: Path) -> Path:

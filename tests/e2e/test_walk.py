@@ -34,7 +34,7 @@ def walked(session_folder: Path) -> tuple[Path, str]:
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=3000,
     )
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
     return folder, done.stdout

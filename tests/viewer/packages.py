@@ -55,7 +55,9 @@ def write_package(
         write(conventions.ENVIRONMENT_U_KTX2, ktx2.texture_array(opaque(u), {}), **about)
         mips = [opaque(mip) for mip in ggx_prefilter(scene.environment, 32, 4, "cpu")]
         write(conventions.ENVIRONMENT_GGX_KTX2, ktx2.texture_cube(mips, {}))
-        exr.write_rgb(folder / conventions.ENVIRONMENT_EXR, opaque(panorama(scene.environment))[..., :3])
+        itself = opaque(panorama(scene.environment))[..., :3]
+        exr.write_rgb(folder / conventions.ENVIRONMENT_EXR, itself)
+        textures[conventions.ENVIRONMENT_EXR] = {"width": itself.shape[1], "height": itself.shape[0]}
     (folder / conventions.MANIFEST_JSON).write_text(_manifest(textures, size * tiles, lobes).model_dump_json())
     return folder
 

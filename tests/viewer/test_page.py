@@ -94,14 +94,18 @@ def test_compressed_textures_that_arrive_together_are_all_decoded(serve, viewer,
     folder = packages.write_package(tmp_path / "package", packages.cabinet_scene(), supercompress=True)
     with serve(folder) as url:
         page = viewer.open(url, viewport=SMALL)
+        described = json.loads((folder / conventions.MANIFEST_JSON).read_text())["textures"][
+            conventions.LIGHT_FIELD_KTX2
+        ]
         told = page.evaluate(
-            """() => new Promise((done) => {
+            """(described) => new Promise((done) => {
                 const worker = new Worker("/static/viewer/page/decode.js", { type: "module" });
                 const told = [];
                 worker.onmessage = ({ data }) => told.push(data.error ?? data.texture.layers) === 6 && done(told);
                 const { href: url } = new URL("/package/lightfield.ktx2", location);
-                for (let name = 0; name < 6; name += 1) worker.postMessage({ name, url });
-            })"""
+                for (let name = 0; name < 6; name += 1) worker.postMessage({ name, url, described });
+            })""",
+            described,
         )
     assert told == [16] * 6
 

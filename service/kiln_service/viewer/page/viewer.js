@@ -17,7 +17,8 @@ export async function start() {
   }
   const began = performance.now();
   const opened = await openPackage(document.body.dataset.package, (share) => {
-    status.textContent = `Loading the package … ${Math.round(100 * share)} %`;
+    // What is still on its way when one file fails must not cover the sentence about it.
+    if (!("failed" in status.dataset)) status.textContent = `Loading the package … ${Math.round(100 * share)} %`;
   });
   performance.mark("package read");
   const picture = new Picture(canvas, opened);
