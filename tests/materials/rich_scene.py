@@ -36,5 +36,7 @@ def rich_scene() -> Scene:
     normals = np.tile(np.float32([0, 0, 1]), (4, 1))
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     colors = random.uniform(size=(4, 4)).astype(np.float32)
-    mesh = Mesh("quad", SQUARE, normals, faces, 0, uv[0], SQUARE[:, :2].copy(), tuple(uv[1:]), colors)
+    # Tangents that nobody would make from the coordinates.
+    tangents = np.float32([[1, 0, 0, -1], [0, 1, 0, -1], [0.6, 0.8, 0, -1], [-1, 0, 0, -1]])
+    mesh = Mesh("quad", SQUARE, normals, faces, 0, uv[0], SQUARE[:, :2].copy(), tuple(uv[1:]), colors, tangents)
     return Scene((mesh,), (material,), images)

@@ -32,7 +32,7 @@ def test_each_texture_is_looked_up_by_its_own_uv_set(irradiance_in):
 
 def same(one: Scene, other: Scene) -> None:
     for a, b in zip(one.meshes, other.meshes, strict=True):
-        for name in ("positions", "normals", "faces", "uv", "lightmap_uv", "colors"):
+        for name in ("positions", "normals", "faces", "uv", "lightmap_uv", "colors", "tangents"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
         for left, right in zip(a.more_uv, b.more_uv, strict=True):
             np.testing.assert_array_equal(left, right)
@@ -56,6 +56,7 @@ def test_scene_glb_carries_all_that_a_surface_has(tmp_path):
         written, read = replace(written, **{name: None}), replace(read, **{name: None})
     assert written == read
     np.testing.assert_array_equal(scene.meshes[0].colors, back.meshes[0].colors)
+    np.testing.assert_allclose(scene.meshes[0].tangents, back.meshes[0].tangents, atol=1e-6)
     np.testing.assert_array_equal(scene.meshes[0].lightmap_uv, back.meshes[0].lightmap_uv)
 
 

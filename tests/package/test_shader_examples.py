@@ -17,8 +17,8 @@ from same_picture import FINER, HEIGHT, LEAST_PSNR, WIDTH, Reference
 
 from kiln_schemas.camera import Camera, read_camera
 from kiln_workers.package import ktx2, shaders
-from kiln_workers.render.textures import uv_matrix
 from kiln_workers.scene.images import linear_pixels
+from kiln_workers.scene.lookup import uv_matrix
 from kiln_workers.scene.model import Mesh, Scene, TextureRef
 from kiln_workers.shade.camera import camera_frame
 from kiln_workers.shade.term import WHOLE, Term

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from kiln_schemas.errors import InputError
+from kiln_workers.scene.lookup import look_up
 from kiln_workers.scene.model import Image, Material, Mesh, Scene, TextureRef
 from kiln_workers.scene.picture import texel_map_picture
 from kiln_workers.scene.push_out import tangent_directions
 from kiln_workers.scene.raster import interior_samples, kept_inside, touched_squares
 from kiln_workers.scene.shapes import Cell, patch, sphere
 from kiln_workers.scene.texel_map import TexelState, pack_texel_map, unpack_texel_map
-from kiln_workers.scene.texels import MIN_COSINE, bent_normals, build_texel_map, rasterise_texels, sample_bilinear
+from kiln_workers.scene.texels import MIN_COSINE, bent_normals, build_texel_map, rasterise_texels
 
 
 def clipped_area(triangle: np.ndarray, column: int, row: int) -> float:
@@ -132,13 +133,26 @@ def test_alpha_follows_the_roughness_texture(make_quad):
     assert mirror.alpha.min() == np.float32(0.002)
 
 
+def test_roughness_is_looked_up_by_its_own_uv_set(make_quad):
+    """The first set is another texture's; by it all would be smooth."""
+    mesh = make_quad("floor", (0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1, 1))
+    mesh = replace(mesh, uv=np.zeros_like(mesh.lightmap_uv), more_uv=(mesh.lightmap_uv,))
+    pixels = np.zeros((1, 2, 3), np.uint8)
+    pixels[0, :, 1] = (51, 255)
+    reference = TextureRef(0, ("clamp", "clamp"), uv_set=1)
+    scene = Scene((mesh,), (Material("m", metallic_roughness_texture=reference),), (Image("r", pixels, False),))
+    alpha = rasterise_texels(scene, 64).alpha
+    np.testing.assert_allclose(alpha[:, :16], 0.2**2, rtol=1e-5)
+    np.testing.assert_allclose(alpha[:, 48:], 1.0, rtol=1e-5)
+
+
 @pytest.mark.parametrize(("wrap", "expected"), [("repeat", [0, 1, 2, 3, 0, 1]), ("mirror", [0, 1, 2, 3, 3, 2])])
 def test_textures_wrap(wrap, expected):
-    image = Image("i", np.arange(4, dtype=np.float32).reshape(1, 4, 1), False)
+    pixels = np.arange(4, dtype=np.float32).reshape(1, 4, 1)
     uv = np.stack([(np.arange(6) + 0.5) / 4, np.full(6, 0.5)], axis=1)
-    np.testing.assert_allclose(sample_bilinear(image, TextureRef(0, (wrap, wrap)), uv, 0), expected, atol=1e-6)
+    np.testing.assert_allclose(look_up(pixels, TextureRef(0, (wrap, wrap)), uv)[:, 0], expected, atol=1e-6)
     shifted = TextureRef(0, (wrap, wrap), offset=(0.25, 0.0), scale=(0.5, 1.0))
-    np.testing.assert_allclose(sample_bilinear(image, shifted, uv[:2] * 2.0, 0), expected[1:3], atol=1e-6)
+    np.testing.assert_allclose(look_up(pixels, shifted, uv[:2] * 2.0)[:, 0], expected[1:3], atol=1e-6)
 
 
 def test_shading_normals_stay_on_the_lit_side():

@@ -3,7 +3,8 @@
 Meshes are already flattened to world space (`scene.model`), so every node is an identity with one mesh, and the
 vertices of the GLB are those that were baked. Those of a scene far from the origin are about a point amid it; a node
 above all others moves them to where the user had them. Textures are embedded as PNG. The first UV set of the textures
-is TEXCOORD_0, further ones are TEXCOORD_2 and so on; vertex colours are COLOR_0. Extensions used:
+is TEXCOORD_0, further ones are TEXCOORD_2 and so on; vertex colours are COLOR_0, and meshes with a
+normal map have TANGENT, the user's or ours. Extensions used:
 KHR_texture_transform, KHR_lights_punctual, KHR_materials_emissive_strength, _transmission, _ior, _specular and
 _clearcoat; all optional to a reader. Written with pygltflib because trimesh loses TEXCOORD_1.
 """
@@ -240,6 +241,8 @@ def _mesh(writer: _Writer, mesh: Mesh) -> gltf.Mesh:
         setattr(attributes, f"TEXCOORD_{_tex_coord(number)}", writer.vertices(more))
     if mesh.colors is not None:
         attributes.COLOR_0 = writer.vertices(mesh.colors)
+    if mesh.tangents is not None:
+        attributes.TANGENT = writer.vertices(_unit_tangents(mesh.tangents))
     indices = writer.indices(mesh.faces, len(mesh.positions))
     return gltf.Mesh(
         name=mesh.name,
@@ -283,6 +286,14 @@ def _unit_normals(normals: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     length = np.linalg.norm(exact, axis=1, keepdims=True)
     unit = np.where(length > 0.0, exact / np.where(length > 0.0, length, 1.0), (0.0, 1.0, 0.0))
     return np.asarray(unit, np.float32)
+
+
+def _unit_tangents(tangents: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Tangents of unit length with a hand of 1 or -1, which glTF demands; a tangent of length 0 becomes +X."""
+    hand = np.where(tangents[:, 3:] < 0.0, -1.0, 1.0)
+    length = np.linalg.norm(tangents[:, :3].astype(np.float64), axis=1, keepdims=True)
+    unit = np.where(length > 0.0, tangents[:, :3] / np.where(length > 0.0, length, 1.0), (1.0, 0.0, 0.0))
+    return np.asarray(np.concatenate([unit, hand], axis=1), np.float32)
 
 
 def _unit(value: float) -> float:

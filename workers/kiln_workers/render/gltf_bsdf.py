@@ -12,6 +12,9 @@ Light goes straight through as far as the surface is no surface (1 - opacity: an
 where KHR_materials_transmission replaces Lambert: tinted by the base colour, less Fresnel's share, from either side.
 What passes is Mitsuba's `Null` component: `eval_null_transmission` has it, `sample` draws it unless its context leaves
 it out, and all other values are already times the opacity.
+A normal map turns the frame that all of this is meant in (`scene.normal_maps`), bent towards i where it would face
+away; light that would leave on the other side of the unmapped surface is lost. What passes straight through does not
+depend on the map.
 Letters: i incident (`si.wi`, to the eye), o scattered (`wo`), h half-way; all in the frame of the shading normal.
 """
 
@@ -20,6 +23,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 from kiln_workers.render.jit import dr, mi
+from kiln_workers.scene.normal_maps import LEAST_FACING, LEAST_HEIGHT
 
 LEAST_CHANCE: Final = 0.1
 """Each of the two lobes that reflects at all is sampled at least this often: bounds the weight of a sample."""
@@ -48,6 +52,8 @@ class _Point:
     alpha: Any  # Float: GGX
     chance: Any  # Float: of the glossy lobe
     opacity: Any  # Float: 1 where the surface is whole
+    frame: Any  # Frame3f of the normal map in the shading frame, on the side of i; None without a map
+    side: Any  # Float: -1 where the back of a double-sided surface is meant
 
 
 @lru_cache(maxsize=4)
@@ -56,16 +62,18 @@ def _register(variant: str) -> None:
         """One-sided unless `double_sided`.
 
         `base_color`, `roughness` (perceptual, above 0), `metallic`, and where given `opacity` and `transmission` are
-        textures; `tint` (the vertices' colour) multiplies the base colour, `tint_alpha` the opacity.
+        textures; `tint` (the vertices' colour) multiplies the base colour, `tint_alpha` the opacity. A `normal_map`
+        needs the mesh's attributes `vertex_tangent` and `vertex_hand`.
         """
 
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
             for name in ("base_color", "roughness", "metallic"):
                 setattr(self, name, properties[name])
-            for name in ("opacity", "tint", "tint_alpha", "transmission"):
+            for name in ("opacity", "tint", "tint_alpha", "transmission", "normal_map"):
                 setattr(self, name, properties.get(name))
             self.f0 = mi.Color3f(*(float(properties.get(f"f0_{channel}", 0.04)) for channel in "rgb"))
+            self.normal_scale = float(properties.get("normal_scale", 1.0))
             self.f90 = float(properties.get("f90", 1.0))
             self.double_sided = bool(properties.get("double_sided", False))
             sides = mi.BSDFFlags.FrontSide
@@ -93,7 +101,27 @@ def _register(variant: str) -> None:
             dull = dr.mean(albedo)
             chance = dr.clip(glossy / dr.maximum(glossy + dull, 1e-8), LEAST_CHANCE, 1.0 - LEAST_CHANCE)
             chance = dr.select(dull > 0.0, chance, 1.0)
-            return _Point(albedo, f0, f90, (dr.max(self.f0), self.f90), alpha, chance, self._opacity(si, active))
+            frame, side = self._frame(si, active)
+            opacity = self._opacity(si, active)
+            return _Point(albedo, f0, f90, (dr.max(self.f0), self.f90), alpha, chance, opacity, frame, side)
+
+        def _frame(self, si: Any, active: Any) -> tuple[Any, Any]:
+            """The normal map's frame on the side of `si.wi`, None without a map; and the sign of that side."""
+            side = mi.Float(1.0)
+            if self.double_sided:
+                side = dr.select(si.wi.z < 0.0, mi.Float(-1.0), mi.Float(1.0))
+            if self.normal_map is None:
+                return None, side
+            texel = self.normal_map.eval_3(si, active)
+            m = 2.0 * mi.Vector3f(texel.x, texel.y, texel.z) - 1.0
+            along = si.to_local(mi.Vector3f(si.shape.eval_attribute_3("vertex_tangent", si, active)))
+            along.z = 0.0
+            along *= dr.rsqrt(dr.maximum(dr.squared_norm(along), 1e-12))
+            up = si.shape.eval_attribute_1("vertex_hand", si, active) * mi.Vector3f(-along.y, along.x, 0.0)
+            scaled = self.normal_scale * (m.x * along + m.y * up)
+            mapped = side * dr.normalize(mi.Vector3f(scaled.x, scaled.y, dr.maximum(m.z, LEAST_HEIGHT)))
+            missing = dr.maximum(LEAST_FACING - dr.dot(mapped, si.wi), 0.0)
+            return mi.Frame3f(dr.normalize(mapped + missing * si.wi)), side
 
         def _base(self, si: Any, active: Any) -> Any:
             base = self.base_color.eval(si, active)
@@ -126,14 +154,15 @@ def _register(variant: str) -> None:
             choice = dr.select(rest > 0.0, (sample1 - straight) / rest, 0.0)
 
             at = self._at(si, active)
-            wi, side = self._facing(si.wi)
+            wi = self._inward(si.wi, at)
             glossy = choice < at.chance
             half, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, at.alpha, True).sample(wi, sample2)
             wo = dr.select(glossy, mi.reflect(wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
             value, pdf = _value_and_pdf(wi, wo, at)
             pdf *= rest
-            reflects = mi.Bool(active) & ~passes & (wi.z > 0.0) & (pdf > 0.0)
-            out.wo = dr.select(passes, -si.wi, mi.Vector3f(wo.x, wo.y, wo.z * side))
+            onwards = self._outward(wo, at)
+            reflects = mi.Bool(active) & ~passes & self._above(si, onwards, at) & (wi.z > 0.0) & (pdf > 0.0)
+            out.wo = dr.select(passes, -si.wi, onwards)
             out.pdf = dr.select(passes, straight, dr.select(reflects, pdf, 0.0))
             component = dr.select(glossy, mi.UInt32(1), mi.UInt32(0))
             out.sampled_component = dr.select(passes, mi.UInt32(2), component)
@@ -151,17 +180,26 @@ def _register(variant: str) -> None:
             return self.eval_pdf(context, si, wo, active)[1]
 
         def eval_pdf(self, context: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            wi, side = self._facing(si.wi)
-            value, pdf = _value_and_pdf(wi, mi.Vector3f(wo.x, wo.y, wo.z * side), self._at(si, active))
+            at = self._at(si, active)
+            value, pdf = _value_and_pdf(self._inward(si.wi, at), self._inward(wo, at), at)
             straight, _ = self._chance_of_passing(context, si, active)
+            active = mi.Bool(active) & self._above(si, wo, at)
             return dr.select(active, value, 0.0), dr.select(active, pdf * (1.0 - straight), 0.0)
 
-        def _facing(self, wi: Any) -> tuple[Any, Any]:
-            """`wi` seen from its own side of a double-sided surface, and the sign of that side."""
-            if not self.double_sided:
-                return wi, mi.Float(1.0)
-            side = dr.select(wi.z < 0.0, mi.Float(-1.0), mi.Float(1.0))
-            return mi.Vector3f(wi.x, wi.y, wi.z * side), side
+        def _inward(self, w: Any, at: _Point) -> Any:
+            """A direction of the shading frame in the frame that the surface is meant in."""
+            return mi.Vector3f(w.x, w.y, w.z * at.side) if at.frame is None else at.frame.to_local(w)
+
+        def _outward(self, w: Any, at: _Point) -> Any:
+            """The reverse of `_inward`."""
+            return mi.Vector3f(w.x, w.y, w.z * at.side) if at.frame is None else at.frame.to_world(w)
+
+        def _above(self, si: Any, wo: Any, at: _Point) -> Any:
+            """Whether light from `si.wi` may leave by `wo`: both have to be on one side of the unmapped surface."""
+            if at.frame is None:
+                return mi.Bool(True)
+            real = dr.dot(si.n, si.to_world(si.wi)) * dr.dot(si.n, si.to_world(wo)) > 0.0
+            return real & (si.wi.z * at.side > 0.0) & (wo.z * at.side > 0.0)
 
         def _chance_of_passing(self, context: Any, si: Any, active: Any) -> tuple[Any, Any]:
             """Probability by which `sample` goes straight on, and what passes [Color3f]."""

@@ -28,6 +28,8 @@ def vertex_attributes(mesh: Mesh) -> dict[str, Float32]:
         out[_uv_name(number)] = np.concatenate([uv, np.zeros_like(uv[:, :1])], axis=1)
     if mesh.colors is not None:
         out["vertex_tint"], out["vertex_alpha"] = mesh.colors[:, :3], mesh.colors[:, 3:]
+    if mesh.tangents is not None:
+        out["vertex_tangent"], out["vertex_hand"] = mesh.tangents[:, :3], mesh.tangents[:, 3:]
     return out
 
 
@@ -50,7 +52,12 @@ class MaterialBuilder:
     def bsdf(self, mesh: Mesh) -> Any:
         """The surface of a mesh."""
         material = self.scene.materials[mesh.material]
-        key: tuple[int, ...] = (mesh.material, len(mesh.uv_sets), int(mesh.colors is not None))
+        key: tuple[int, ...] = (
+            mesh.material,
+            len(mesh.uv_sets),
+            int(mesh.colors is not None),
+            int(mesh.tangents is not None),
+        )
         if any(reference.wrap[0] != reference.wrap[1] for reference in material.textures):
             key = (*key, id(mesh))  # its textures are unrolled over this mesh's coordinates
         if key not in self._known:
@@ -99,6 +106,10 @@ class MaterialBuilder:
                 surface["tint_alpha"] = mi.load_dict({"type": "mesh_attribute", "name": "vertex_alpha"})
         if material.transmission > 0.0:
             surface["transmission"] = self._channel(material.transmission, material.transmission_texture, 0, mesh, 0.0)
+        reference = material.normal_texture
+        if reference is not None and mesh.tangents is not None and mesh.uv_of(reference) is not None:
+            pixels = linear_pixels(self.scene.images[reference.image])[..., :3]
+            surface |= {"normal_map": _lookup(pixels, reference, mesh), "normal_scale": float(material.normal_scale)}
         return mi.load_dict(surface)
 
     def _reflectance(self, material: Material, mesh: Mesh) -> dict[str, Any]:

@@ -73,11 +73,14 @@ def back_sheet(mesh: Mesh, gap: Floats) -> Mesh:
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
     order = mesh.faces[:, ::-1].reshape(-1)
+    turned = mesh.with_vertices(order, np.arange(len(order), dtype=np.int32).reshape(-1, 3))
     return replace(
-        mesh.with_vertices(order, np.arange(len(order), dtype=np.int32).reshape(-1, 3)),
+        turned,
         name=f"{mesh.name} (back)",
         positions=(corners - (gap[:, None] * normal)[:, None])[:, ::-1].reshape(-1, 3).astype(np.float32),
         normals=-np.repeat(normal, 3, axis=0).astype(np.float32),
+        # So that mapped normals are the front's, turned over.
+        tangents=None if turned.tangents is None else -turned.tangents,
     )
 
 

@@ -2,11 +2,8 @@
 
 Mitsuba's `bitmap` given a tensor has its first row at v = 0, as glTF has it, so nothing is flipped. It knows one wrap
 mode for both axes; where a glTF sampler has two, the image is unrolled over the range of coordinates that is in use.
-KHR_texture_transform scales, then rotates counter-clockwise as seen on the image (v down), then offsets:
-(u', v') = offset + (cos r u + sin r v, -sin r u + cos r v) with (u, v) scaled.
 """
 
-import math
 from typing import Any, Final
 
 import numpy as np
@@ -14,6 +11,7 @@ import numpy.typing as npt
 
 from kiln_schemas.errors import TooLarge
 from kiln_workers.render.jit import mi
+from kiln_workers.scene.lookup import uv_matrix, wrapped
 from kiln_workers.scene.model import Float32, TextureRef
 
 Floats = npt.NDArray[np.float64]
@@ -23,19 +21,6 @@ LARGEST_UNROLLED: Final = 1 << 26
 
 OPACITY_OVERSAMPLING: Final = 4
 """An alpha-tested texture is magnified by this factor before the test, so that its edges are not blocky."""
-
-
-def uv_matrix(reference: TextureRef) -> Floats:
-    """KHR_texture_transform as a 3 x 3 matrix on (u, v, 1)."""
-    cosine, sine = math.cos(reference.rotation), math.sin(reference.rotation)
-    scale_u, scale_v = reference.scale
-    return np.array(
-        [
-            [cosine * scale_u, sine * scale_v, reference.offset[0]],
-            [-sine * scale_u, cosine * scale_v, reference.offset[1]],
-            [0.0, 0.0, 1.0],
-        ]
-    )
 
 
 def bitmap(pixels: Float32, reference: TextureRef, uv: Float32 | None, nearest: bool = False) -> dict[str, Any]:
@@ -62,7 +47,7 @@ def thresholded(alpha: Float32, cutoff: float, wrap: tuple[str, str]) -> Float32
         position = (np.arange(size * OPACITY_OVERSAMPLING) + 0.5) / OPACITY_OVERSAMPLING - 0.5
         lower = np.floor(position).astype(np.int64)
         weight = np.expand_dims((position - lower).astype(np.float32), 1 - axis)
-        first, second = (np.take(alpha, _wrapped(lower + k, size, mode), axis=axis) for k in (0, 1))
+        first, second = (np.take(alpha, wrapped(lower + k, size, mode), axis=axis) for k in (0, 1))
         alpha = first * (1.0 - weight) + second * weight
     return (alpha >= cutoff).astype(np.float32)[..., None]
 
@@ -80,17 +65,8 @@ def _unrolled(pixels: Float32, reference: TextureRef, matrix: Floats, uv: Float3
             where=f"image {reference.image}",
             remedy="Use one wrap mode for both axes, or keep the coordinates near [0, 1].",
         )
-    columns = _wrapped(np.arange(low[0] * width, high[0] * width), width, reference.wrap[0])
-    rows = _wrapped(np.arange(low[1] * height, high[1] * height), height, reference.wrap[1])
+    columns = wrapped(np.arange(low[0] * width, high[0] * width), width, reference.wrap[0])
+    rows = wrapped(np.arange(low[1] * height, high[1] * height), height, reference.wrap[1])
     span = (high - low).astype(np.float64)
     window = np.array([[1 / span[0], 0.0, -low[0] / span[0]], [0.0, 1 / span[1], -low[1] / span[1]], [0.0, 0.0, 1.0]])
     return pixels[rows[:, None], columns[None, :]], window
-
-
-def _wrapped(index: npt.NDArray[np.int64], size: int, mode: str) -> npt.NDArray[np.int64]:
-    if mode == "clamp":
-        return np.clip(index, 0, size - 1)
-    if mode == "mirror":
-        folded = index % (2 * size)
-        return np.where(folded < size, folded, 2 * size - 1 - folded)
-    return index % size

@@ -115,6 +115,8 @@ def _parts(scene: Scene) -> tuple[dict[str, Any], dict[str, Array]]:
             arrays[f"mesh{i}.lightmap_uv"] = mesh.lightmap_uv
         if mesh.colors is not None:
             arrays[f"mesh{i}.colors"] = mesh.colors
+        if mesh.tangents is not None:
+            arrays[f"mesh{i}.tangents"] = mesh.tangents
         arrays |= {f"mesh{i}.uv{number}": values for number, values in enumerate(mesh.more_uv, start=1)}
     for i, image in enumerate(scene.images):
         arrays[f"image{i}"] = image.pixels
@@ -156,6 +158,7 @@ def _mesh(arrays: dict[str, Array], index: int, entry: _MeshEntry) -> Mesh:
         lightmap_uv=_floats(arrays, f"{key}.lightmap_uv", (count, 2)) if f"{key}.lightmap_uv" in arrays else None,
         more_uv=tuple(_floats(arrays, f"{key}.uv{number}", (count, 2)) for number in range(1, 1 + entry.more_uv)),
         colors=_floats(arrays, f"{key}.colors", (count, 4)) if f"{key}.colors" in arrays else None,
+        tangents=_floats(arrays, f"{key}.tangents", (count, 4)) if f"{key}.tangents" in arrays else None,
     )
 
 

@@ -37,6 +37,7 @@ class RawMesh:
     lightmap_uv: Floats | None = None  # [V, 2]
     more_uv: tuple[Floats, ...] = ()  # [V, 2] each
     colors: Floats | None = None  # [V, 4] linear RGBA
+    tangents: Floats | None = None  # [V, 4] as glTF's TANGENT
 
 
 def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, list[str]]:
@@ -85,6 +86,9 @@ def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, l
         lightmap_uv=_picked(raw.lightmap_uv, used),
         more_uv=tuple(values[used].astype(np.float32) for values in raw.more_uv),
         colors=_picked(raw.colors, used),
+        tangents=None
+        if raw.tangents is None or raw.normals is None
+        else _transformed_tangents(raw.tangents[used], linear),
     )
     return mesh, notes
 
@@ -158,6 +162,15 @@ def _transformed_normals(normals: Floats, linear: Floats, positions: Floats, fac
     if bad.any():
         world[bad] = smooth_normals(positions, faces)[bad]
     return world, int(bad.sum())
+
+
+def _transformed_tangents(tangents: Floats, linear: Floats) -> Float32:
+    """Tangents [V, 4] go with the surface; a mirror turns the handedness over. Those of no length become 0."""
+    world = np.where(np.isfinite(tangents[:, :3]), tangents[:, :3], 0.0) @ linear.T
+    length = np.linalg.norm(world, axis=1, keepdims=True)
+    world = world / np.where(length > 1e-30, length, 1.0)
+    hand = np.where(tangents[:, 3:] < 0.0, -1.0, 1.0) * (-1.0 if np.linalg.det(linear) < 0.0 else 1.0)
+    return np.concatenate([world, hand], axis=1).astype(np.float32)
 
 
 def _check(raw: RawMesh) -> None:

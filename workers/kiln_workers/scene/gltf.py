@@ -262,6 +262,10 @@ class _Reader:
             lightmap_uv=attribute("TEXCOORD_1", 2),
             more_uv=tuple(values for values in uv[1:] if values is not None),
             colors=self._colors(primitive, packed, name, len(positions), used),
+            # A morphed surface has other tangents than the file's.
+            tangents=attribute("TANGENT", 4)
+            if materials.materials[material].normal_texture and not any(weights)
+            else None,
         )
         return _Part(raw, None if influence is None else (influence[0][used], influence[1][used]))
 

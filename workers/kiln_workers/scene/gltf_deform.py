@@ -108,5 +108,9 @@ def skinned(raw: RawMesh, influence: Influences, joints: Floats) -> RawMesh:
             a, b, c = linear[:, :, 0], linear[:, :, 1], linear[:, :, 2]
             cofactor = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
             normals = np.einsum("vij,vj->vi", cofactor, raw.normals) * (-1.0 if mirrored else 1.0)
+        tangents = None
+        if raw.tangents is not None:
+            along = np.einsum("vij,vj->vi", linear, raw.tangents[:, :3])
+            tangents = np.concatenate([along, raw.tangents[:, 3:] * (-1.0 if mirrored else 1.0)], axis=1)
     faces = raw.faces[:, ::-1] if mirrored else raw.faces
-    return replace(raw, positions=positions, normals=normals, faces=faces)
+    return replace(raw, positions=positions, normals=normals, faces=faces, tangents=tangents)

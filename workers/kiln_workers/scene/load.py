@@ -20,6 +20,7 @@ from kiln_workers.scene.obj import read_obj
 from kiln_workers.scene.origin import about_own_centre
 from kiln_workers.scene.ply import read_ply
 from kiln_workers.scene.solids import read_off, read_stl
+from kiln_workers.scene.tangents import with_tangents
 
 READERS: Final[Mapping[str, Callable[[Path, str], Scene]]] = {
     ".gltf": read_gltf,
@@ -44,7 +45,7 @@ def load_scene(folder: Path, entry: str, environment: EnvironmentRef | None = No
 
 
 def _read(reader: Callable[[Path, str], Scene], folder: Path, entry: str, environment: EnvironmentRef | None) -> Scene:
-    scene = about_own_centre(reader(folder, entry))
+    scene = with_tangents(about_own_centre(reader(folder, entry)))
     if not scene.triangles:
         raise InputError("has no faces", where=entry, remedy="Export at least one mesh with triangles of some area.")
     if environment is None:

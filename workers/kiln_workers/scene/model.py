@@ -116,6 +116,7 @@ class Mesh:
     lightmap_uv: Float32 | None = None  # [V, 2] in the light-map atlas, v downwards
     more_uv: tuple[Float32, ...] = ()  # [V, 2] each: the sets after `uv`
     colors: Float32 | None = None  # [V, 4] linear RGBA, multiplies the base colour
+    tangents: Float32 | None = None  # [V, 4] unit, w the handedness; where the material has a normal map
 
     @property
     def uv_sets(self) -> tuple[Float32, ...]:
@@ -143,6 +144,7 @@ class Mesh:
             lightmap_uv=picked(self.lightmap_uv),
             more_uv=tuple(values[vertices] for values in self.more_uv),
             colors=picked(self.colors),
+            tangents=picked(self.tangents),
         )
 
 

@@ -3,7 +3,8 @@
 A texel that a chart's triangle touches gets the point of that chart closest to the texel's centre, so bilinear
 interpolation on the surface never needs a texel without a point. Where several triangles touch one texel, one
 that contains the centre wins, else the nearest. `alpha` is the material's roughness at that point, squared, at least
-0.002 (Filament's bound for perceptual roughness, 0.045, squared): narrower lobes are mirrors to every later stage.
+0.002 (Filament's bound for perceptual roughness, 0.045, squared): narrower lobes are mirrors to every later stage. The
+shading normal is the interpolated one, or the mean of the normal map's over the texel (`texel_surface`).
 
 Terminator of smooth normals: paths start from the point that Hanika 2021 ("Hacking the Shadow Terminator", Ray Tracing
 Gems II, chapter 4) gives: the flat triangle's point is lifted to the interpolation of its projections on the vertices'
@@ -24,15 +25,15 @@ from scipy.sparse.csgraph import connected_components
 
 from kiln_schemas.errors import InputError
 from kiln_workers.render.backend import Device
+from kiln_workers.scene import texel_surface
 from kiln_workers.scene.container import Array
 from kiln_workers.scene.geometry import Floats, Ints, face_areas, face_normals
-from kiln_workers.scene.model import Image, Mesh, Scene, TextureRef
+from kiln_workers.scene.model import Mesh, Scene
 from kiln_workers.scene.precision import face_clearance
 from kiln_workers.scene.push_out import BareTriangles, push_out
 from kiln_workers.scene.raster import kept_inside, touched_squares
 from kiln_workers.scene.texel_map import TexelMap, TexelState
 
-MIN_ALPHA: Final = 0.002
 MIN_COSINE: Final = 0.05
 """A shading normal is bent towards the geometric one until their cosine is at least this."""
 INSET_TEXELS: Final = 0.02
@@ -64,14 +65,20 @@ def rasterise_texels(scene: Scene, resolution: int, device: Device = "auto") -> 
 
     normal = faces.normal[touched.face]
     flat = np.einsum("sc,scd->sd", weight, faces.positions[corner])
-    shading = np.einsum("sc,scd->sd", weight, faces.normals[corner])
+    mesh = faces.mesh[touched.face]
+    squares = texel_surface.Squares(
+        mesh,
+        faces.own_corners[touched.face],
+        weight,
+        texel_surface.gradients(faces.lightmap_uv * resolution)[touched.face],
+    )
+    shading = texel_surface.shading_normals(scene, squares)
     size = sizes[touched.face]
     lift = terminator_offset(flat, weight, faces.positions[corner], faces.normals[corner])
     position = flat + clearance[touched.face, None] * normal
     position += _free_lift(scene, position, lift, 0.5 * size, device)
 
     grid = (resolution, resolution)
-    mesh = faces.mesh[touched.face]
 
     def spread(values: Floats | Ints, dtype: type, empty: int = 0) -> Array:
         out = np.full((resolution * resolution, *values.shape[1:]), empty, dtype=dtype)
@@ -83,7 +90,7 @@ def rasterise_texels(scene: Scene, resolution: int, device: Device = "auto") -> 
         position=spread(position, np.float32),
         normal=spread(normal, np.float32),
         shading_normal=spread(bent_normals(shading, normal), np.float32),
-        alpha=spread(_alpha(scene, mesh, np.einsum("sc,scd->sd", weight, faces.uv[corner])), np.float32),
+        alpha=spread(texel_surface.alpha(scene, squares), np.float32),
         texel_size=spread(size, np.float32),
         mesh=spread(mesh, np.int32, -1),
         chart=spread(faces.charts()[touched.face], np.int32, -1),
@@ -122,48 +129,6 @@ def bent_normals(shading: Floats, geometric: Floats) -> Floats:
     return np.asarray(lifted / np.linalg.norm(lifted, axis=1, keepdims=True))
 
 
-def sample_bilinear(image: Image, texture: TextureRef, uv: Floats, channel: int) -> Floats:
-    """One channel [S] of a texture at uv [S, 2], 8-bit values as 0 ... 1, without linearisation."""
-    pixels = image.pixels[..., min(channel, image.pixels.shape[2] - 1)]
-    height, width = pixels.shape
-    # KHR_texture_transform: uv' = translation * rotation * scale * uv, v downwards.
-    cosine, sine = np.cos(texture.rotation), np.sin(texture.rotation)
-    u, v = uv[:, 0] * texture.scale[0], uv[:, 1] * texture.scale[1]
-    x = (cosine * u + sine * v + texture.offset[0]) * width - 0.5
-    y = (-sine * u + cosine * v + texture.offset[1]) * height - 0.5
-    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    across, down = x - left, y - top
-    columns = [_wrapped(left + i, width, texture.wrap[0]) for i in (0, 1)]
-    rows = [_wrapped(top + i, height, texture.wrap[1]) for i in (0, 1)]
-    upper = pixels[rows[0], columns[0]] * (1.0 - across) + pixels[rows[0], columns[1]] * across
-    lower = pixels[rows[1], columns[0]] * (1.0 - across) + pixels[rows[1], columns[1]] * across
-    value = np.asarray(upper * (1.0 - down) + lower * down)
-    return value / 255.0 if image.pixels.dtype == np.uint8 else value
-
-
-def _wrapped(index: Ints, size: int, wrap: str) -> Ints:
-    if wrap == "repeat":
-        return np.asarray(np.mod(index, size))
-    if wrap == "mirror":
-        folded = np.mod(index, 2 * size)
-        return np.asarray(np.minimum(folded, 2 * size - 1 - folded))
-    return np.clip(index, 0, size - 1)
-
-
-def _alpha(scene: Scene, mesh: Ints, uv: Floats) -> Floats:
-    """GGX alpha [S] at points of meshes [S] with texture coordinates [S, 2]."""
-    out = np.zeros(len(mesh))
-    for index, part in enumerate(scene.meshes):
-        material = scene.materials[part.material]
-        mine = mesh == index
-        roughness = np.full(int(mine.sum()), material.roughness)
-        texture = material.metallic_roughness_texture
-        if texture is not None and part.uv is not None:
-            roughness *= sample_bilinear(scene.images[texture.image], texture, uv[mine], channel=1)
-        out[mine] = np.maximum(roughness**2, MIN_ALPHA)
-    return out
-
-
 class _AllFaces:
     """The faces of all meshes in one list, in float64."""
 
@@ -171,13 +136,9 @@ class _AllFaces:
         offsets = np.cumsum([0] + [len(mesh.positions) for mesh in scene.meshes])
         self.positions = np.concatenate([mesh.positions for mesh in scene.meshes]).astype(np.float64)
         self.normals = np.concatenate([mesh.normals for mesh in scene.meshes]).astype(np.float64)
-        self.uv = np.concatenate(
-            [np.zeros((len(mesh.positions), 2)) if mesh.uv is None else mesh.uv for mesh in scene.meshes]
-        ).astype(np.float64)
-        self.corners = np.concatenate(
-            [mesh.faces.astype(np.int64) + offset for mesh, offset in zip(scene.meshes, offsets, strict=False)]
-        )  # [F, 3]
+        self.own_corners = np.concatenate([mesh.faces.astype(np.int64) for mesh in scene.meshes])  # [F, 3] in the mesh
         self.mesh = np.repeat(np.arange(len(scene.meshes)), [len(mesh.faces) for mesh in scene.meshes])
+        self.corners = self.own_corners + offsets[self.mesh][:, None]  # [F, 3] in all of them
         self._flat_uv = np.concatenate([_lightmap_uv(mesh) for mesh in scene.meshes])
         self.lightmap_uv = self._flat_uv[self.corners].astype(np.float64)  # [F, 3, 2]
         self.normal = face_normals(self.positions, self.corners)

@@ -15,6 +15,7 @@ from kiln_workers.render.backend import Device, select_variant
 from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.mitsuba_scene import mesh_number
 from kiln_workers.render.paths import PathTracer, off_surface
+from kiln_workers.scene import normal_maps
 from kiln_workers.scene.model import Float32, Mesh, Scene
 from kiln_workers.scene.origin import local_camera
 from kiln_workers.scene.precision import face_clearance
@@ -115,6 +116,7 @@ class _Vertices:
     clearance: Floats  # [P] metres
     tint: Floats  # [P, 4] vertex colours, 1 where there are none
     uv: Floats  # [P, sets, 2] 0 where a mesh lacks a set
+    tangent: Floats  # [P, 4] 0 where a mesh has none: then it has no normal map
 
 
 def _interpolated(scene: Scene, mesh: Ints, face: Ints, position: Float32) -> _Vertices:
@@ -122,8 +124,8 @@ def _interpolated(scene: Scene, mesh: Ints, face: Ints, position: Float32) -> _V
     count = len(mesh)
     sets = max((len(one.uv_sets) for one in scene.meshes), default=0)
     normal, face_normal, lightmap_uv = (np.zeros((count, size)) for size in (3, 3, 2))
-    tint, uv = np.ones((count, 4)), np.zeros((count, sets, 2))
-    out = _Vertices(position.astype(np.float64), normal, face_normal, lightmap_uv, np.zeros(count), tint, uv)
+    tint, uv, tangent = np.ones((count, 4)), np.zeros((count, sets, 2)), np.zeros((count, 4))
+    out = _Vertices(position.astype(np.float64), normal, face_normal, lightmap_uv, np.zeros(count), tint, uv, tangent)
     for number in np.unique(mesh):
         at = mesh == number
         one = scene.meshes[number]
@@ -133,7 +135,8 @@ def _interpolated(scene: Scene, mesh: Ints, face: Ints, position: Float32) -> _V
         mean = np.einsum("pk,pkc->pc", weights, one.normals[corners].astype(np.float64))
         out.normal[at] = mean / np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), 1e-30)
         coordinates = [(out.uv[:, number], values) for number, values in enumerate(one.uv_sets)]
-        for target, values in (*coordinates, (out.lightmap_uv, one.lightmap_uv), (out.tint, one.colors)):
+        attributes = (out.lightmap_uv, one.lightmap_uv), (out.tint, one.colors), (out.tangent, one.tangents)
+        for target, values in (*coordinates, *attributes):
             if values is not None:
                 target[at] = np.einsum("pk,pkc->pc", weights, values[corners].astype(np.float64))
     return out
@@ -166,9 +169,13 @@ def _gbuffer(
     # Where the interpolated normal faces away from the eye the geometric one is taken, as the path tracer does.
     away = np.einsum("pc,pc->p", normal, view) <= 0.0
     normal[away] = face_normal[away]
+    unmapped = normal.copy()
+    bumpy = surface.tangent.any(axis=1)
+    mapped = normal_maps.placed(normal[bumpy], (side * surface.tangent)[bumpy], reflectance.normal[bumpy])
+    normal[bumpy] = normal_maps.facing(mapped, view[bumpy].astype(np.float64))
     # As `kiln_gltf.eval_null_transmission`.
     f0, f90 = reflectance.dielectric[:, :3].max(axis=1), reflectance.dielectric[:, 3]
-    cosine = np.clip(np.abs(np.einsum("pc,pc->p", normal, view)), 0.0, 1.0)
+    cosine = np.clip(np.abs(np.einsum("pc,pc->p", unmapped, view)), 0.0, 1.0)
     kept = reflectance.transmission * (1.0 - reflectance.metallic) * (1.0 - f0 - (f90 - f0) * (1.0 - cosine) ** 5)
     opacity = reflectance.opacity[:, None]
     return GBuffer(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from kiln_workers.render.textures import uv_matrix
+from kiln_workers.scene import lookup, normal_maps
 from kiln_workers.scene.images import linear_pixels
 from kiln_workers.scene.model import Float32, Image, Material, Scene, TextureRef
 
@@ -26,6 +26,7 @@ class Reflectance:
     roughness: Float32  # [P] perceptual; GGX alpha = roughness^2
     emission: Float32  # [P, 3] radiance
     double_sided: npt.NDArray[np.bool_]  # [P]
+    normal: Floats  # [P, 3] vector of the normal map in its tangents' frame; (0, 0, 1) without a map
     dielectric: Float32  # [P, 4] F0 of the dielectric, and its F90
     opacity: Float32  # [P] how much of the surface is there: blended alpha, else 1
     transmission: Float32  # [P] the part of the dielectric's base that lets light through
@@ -40,6 +41,7 @@ def evaluate(scene: Scene, material: Ints, uv: Floats, tint: Floats) -> Reflecta
         roughness=np.zeros(count, np.float32),
         emission=np.zeros((count, 3), np.float32),
         double_sided=np.zeros(count, np.bool_),
+        normal=np.tile([0.0, 0.0, 1.0], (count, 1)),
         dielectric=np.zeros((count, 4), np.float32),
         opacity=np.zeros(count, np.float32),
         transmission=np.zeros(count, np.float32),
@@ -65,6 +67,8 @@ def _evaluate_one(
     out.metallic[at] = np.clip(material.metallic * glossy[:, 2], 0.0, 1.0)
     out.emission[at] = np.asarray(material.emission) * texture(material.emission_texture)[:, :3]
     out.double_sided[at] = material.double_sided
+    if material.normal_texture is not None and material.normal_texture.uv_set < uv.shape[1]:
+        out.normal[at] = normal_maps.decoded(texture(material.normal_texture)[:, :3], material.normal_scale)
     out.dielectric[at] = (*material.dielectric_f0, material.dielectric_f90)
     out.opacity[at] = np.clip(base[:, 3], 0.0, 1.0) if material.blend else 1.0
     out.transmission[at] = np.clip(material.transmission * texture(material.transmission_texture)[:, 0], 0.0, 1.0)
@@ -72,24 +76,4 @@ def _evaluate_one(
 
 def look_up(image: Image, reference: TextureRef, uv: Floats) -> Floats:
     """Linear RGBA [P, 4] of a texture at coordinates [P, 2], bilinear."""
-    pixels = linear_pixels(image).astype(np.float64)
-    matrix = uv_matrix(reference)
-    at = (uv @ matrix[:2, :2].T + matrix[:2, 2]) * (pixels.shape[1], pixels.shape[0]) - 0.5
-    low = np.floor(at).astype(np.int64)
-    weight = at - low
-    columns = [_wrapped(low[:, 0] + k, pixels.shape[1], reference.wrap[0]) for k in (0, 1)]
-    rows = [_wrapped(low[:, 1] + k, pixels.shape[0], reference.wrap[1]) for k in (0, 1)]
-    across = weight[:, :1]
-    top = pixels[rows[0], columns[0]] * (1.0 - across) + pixels[rows[0], columns[1]] * across
-    bottom = pixels[rows[1], columns[0]] * (1.0 - across) + pixels[rows[1], columns[1]] * across
-    return np.asarray(top * (1.0 - weight[:, 1:]) + bottom * weight[:, 1:])
-
-
-def _wrapped(index: Ints, size: int, mode: str) -> Ints:
-    """Pixel numbers under a wrap mode: clamp, mirror or repeat."""
-    if mode == "clamp":
-        return np.clip(index, 0, size - 1)
-    if mode == "mirror":
-        folded = index % (2 * size)
-        return np.where(folded < size, folded, 2 * size - 1 - folded)
-    return index % size
+    return lookup.look_up(linear_pixels(image), reference, uv)

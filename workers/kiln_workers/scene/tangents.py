@@ -1,0 +1,107 @@
+"""Tangents of meshes whose material has a normal map: the file's own, else made from the map's coordinates.
+
+Made as MikkTSpace does (Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited", which glTF 2.0, 3.7.2.1 asks for):
+each face's dP/du is laid into the plane of a corner's normal and weighed by the corner's angle; corners that agree in
+place, normal, coordinates and handedness share the sum. A vertex whose faces are of both hands (a mirrored half begins
+there) becomes two. The coordinates are those on the image, after KHR_texture_transform: a turned map turns the bumps.
+We deviate where faces of one hand touch in a vertex alone: MikkTSpace keeps them apart.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from kiln_workers.scene.lookup import Floats, Ints, transformed
+from kiln_workers.scene.model import Mesh, Scene
+
+LEAST_TANGENT: Final = 0.5
+"""A vertex whose tangent from the file is shorter has none."""
+
+
+def with_tangents(scene: Scene) -> Scene:
+    """The scene with tangents on every mesh whose normal map can be looked up, and on no other."""
+    return replace(scene, meshes=tuple(_with_tangents(scene, mesh) for mesh in scene.meshes))
+
+
+def _with_tangents(scene: Scene, mesh: Mesh) -> Mesh:
+    reference = scene.materials[mesh.material].normal_texture
+    uv = mesh.uv_of(reference)
+    if reference is None or uv is None:
+        return replace(mesh, tangents=None)
+    if mesh.tangents is not None and np.linalg.norm(mesh.tangents[:, :3], axis=1).min(initial=1.0) > LEAST_TANGENT:
+        return mesh
+    return made(mesh, transformed(uv, reference))
+
+
+def made(mesh: Mesh, uv: Floats) -> Mesh:
+    """The mesh with tangents along growing u; `uv` [V, 2] are coordinates on the image, v down."""
+    corners = mesh.positions.astype(np.float64)[mesh.faces]  # [F, 3, 3]
+    along, mirrored, flat = _face_tangents(corners, uv[mesh.faces])
+    hand = _hands(mesh.faces, mirrored, flat)
+    vertex = mesh.faces.reshape(-1).astype(np.int64)
+    pair, first, corner = np.unique(2 * vertex + np.repeat(hand, 3), return_index=True, return_inverse=True)
+    group = _groups(mesh, uv, pair)[corner]
+
+    normals = mesh.normals.astype(np.float64)[vertex]
+    share = _unit(
+        np.repeat(along, 3, axis=0) - np.einsum("cd,cd->c", np.repeat(along, 3, axis=0), normals)[:, None] * normals
+    )
+    total = np.zeros((int(group.max(initial=-1)) + 1, 3))
+    np.add.at(total, group, share * _angles(corners).reshape(-1, 1))
+    normal = normals[first]
+    tangent = total[group[first]]
+    tangent -= np.einsum("vd,vd->v", tangent, normal)[:, None] * normal
+    lost = np.linalg.norm(tangent, axis=1) < 1e-9
+    tangent = np.where(lost[:, None], _across(normal), tangent)
+    sign = np.where(pair % 2 == 1, -1.0, 1.0)[:, None]
+    out = mesh.with_vertices(pair // 2, corner.reshape(-1, 3).astype(np.int32))
+    return replace(out, tangents=np.concatenate([_unit(tangent), sign], axis=1).astype(np.float32))
+
+
+def _face_tangents(corners: Floats, uv: Floats) -> tuple[Floats, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Of faces [F, 3, 3]: unit dP/du [F, 3], whether their coordinates [F, 3, 2] are mirrored, or have no area [F]."""
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    (du1, dv1), (du2, dv2) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
+    area = du1 * dv2 - du2 * dv1
+    size = np.maximum(np.abs(uv - uv[:, :1]).max(axis=(1, 2)), 1e-30)
+    flat = np.abs(area) < 1e-12 * size * size
+    along = np.sign(area)[:, None] * (e1 * dv2[:, None] - e2 * dv1[:, None])
+    # v grows downwards: coordinates that are not mirrored run clockwise.
+    return np.where(flat[:, None], 0.0, _unit(along)), area > 0.0, flat
+
+
+def _hands(faces: npt.NDArray[np.integer], mirrored: npt.NDArray[np.bool_], flat: npt.NDArray[np.bool_]) -> Ints:
+    """1 for mirrored faces [F], else 0; a face whose coordinates have no area is as its first corner's others are."""
+    known = np.zeros(int(faces.max(initial=-1)) + 1, bool)
+    known[faces[mirrored & ~flat].reshape(-1)] = True
+    known[faces[~mirrored & ~flat].reshape(-1)] = False
+    return np.where(flat, known[faces[:, 0]], mirrored).astype(np.int64)
+
+
+def _groups(mesh: Mesh, uv: Floats, pair: Ints) -> Ints:
+    """Number of the tangent that each pair of vertex and hand shares with those at its place."""
+    vertex = pair // 2
+    rows = np.concatenate([mesh.positions[vertex], mesh.normals[vertex], uv[vertex].astype(np.float32)], axis=1)
+    keys = np.ascontiguousarray(rows.astype(np.float32) + np.float32(0.0)).view(np.int32)
+    return np.unique(np.column_stack([keys, pair % 2]), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _angles(corners: Floats) -> Floats:
+    """Angle [F, 3] at each corner of faces [F, 3, 3]."""
+    ahead = _unit(np.roll(corners, -1, axis=1) - corners)
+    behind = _unit(np.roll(corners, 1, axis=1) - corners)
+    return np.asarray(np.arccos(np.clip(np.einsum("fcd,fcd->fc", ahead, behind), -1.0, 1.0)))
+
+
+def _across(normal: Floats) -> Floats:
+    """Some vectors [V, 3] across unit normals [V, 3]."""
+    other = np.where(np.abs(normal[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    return np.cross(other, normal)
+
+
+def _unit(vectors: Floats) -> Floats:
+    """Unit vectors [..., 3]; zero stays zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0))
