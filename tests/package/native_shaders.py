@@ -66,11 +66,13 @@ def run(code: str | bytes, inputs: np.ndarray, textures: Mapping[str, Image]) ->
 class Drawn:
     """A mesh and its material, as the example programs take them."""
 
-    vertices: np.ndarray  # float32 [V, 10] position, normal, TEXCOORD_0, TEXCOORD_1
+    vertices: np.ndarray  # float32 [V, 22] position, normal, TEXCOORD_0, TEXCOORD_1, COLOR_0, TEXCOORD_2, _3, TANGENT
     indices: np.ndarray  # uint32 [F, 3]
     material: bytes
-    maps: tuple[Image, Image, Image]  # base colour, metallic and roughness, emission
+    maps: tuple[Image | None, ...]  # base colour, metallic and roughness, emission, normal; None where not bound
     wrap: tuple[str, str]  # WebGPU's names
+    stages: tuple["Stage", "Stage"]
+    veil: bool  # what is behind it is seen through it
 
 
 @dataclass(frozen=True)
@@ -80,27 +82,32 @@ class Stage:
 
 
 def draw(
-    stages: tuple[Stage, Stage],
+    uniforms: Mapping[int, bytes], light: Mapping[int, Image], meshes: Sequence[Drawn], size: tuple[int, int]
+) -> np.ndarray:
+    """The picture float32 [H, W, 4] that example programs draw; bindings are numbered as in surface.wgsl.
+
+    Veils are drawn after all else, in their order, and laid over it by their alpha, with which they are multiplied.
+    """
+    picture = np.zeros((*size[::-1], 4), np.float32)
+    opaque = [mesh for mesh in meshes if not mesh.veil]
+    for veil in (None, *(mesh for mesh in meshes if mesh.veil)):
+        # What stands before a veil hides it: all is drawn again, black and opaque, but for the veil.
+        layer = _drawn(uniforms, light, opaque, veil, size)
+        picture = layer if veil is None else layer + (1.0 - layer[..., 3:]) * picture
+    return picture
+
+
+def _drawn(
     uniforms: Mapping[int, bytes],
     light: Mapping[int, Image],
-    meshes: Sequence[Drawn],
+    opaque: Sequence[Drawn],
+    veil: Drawn | None,
     size: tuple[int, int],
 ) -> np.ndarray:
-    """The picture float32 [H, W, 4] that an example program draws; bindings are numbered as in surface.wgsl."""
+    """The opaque meshes [H, W, 4], or a veil alone, 0 where they hide it."""
     from wgpu import BufferUsage, TextureUsage
 
     device, (width, height) = _device(), size
-    vertex, fragment = (
-        {"module": device.create_shader_module(code=stage.code), "entry_point": stage.entry} for stage in stages
-    )
-    offsets = zip((0, 12, 24, 32), ("float32x3", "float32x3", "float32x2", "float32x2"), strict=True)
-    attributes = [{"shader_location": k, "offset": at, "format": of} for k, (at, of) in enumerate(offsets)]
-    pipeline = device.create_render_pipeline(
-        layout="auto",
-        vertex=vertex | {"buffers": [{"array_stride": 40, "attributes": attributes}]},
-        fragment=fragment | {"targets": [{"format": "rgba32float"}]},
-        depth_stencil={"format": "depth32float", "depth_write_enabled": True, "depth_compare": "less"},
-    )
     picture, depth = (
         device.create_texture(
             size=(width, height, 1), format=of, usage=TextureUsage.RENDER_ATTACHMENT | TextureUsage.COPY_SRC
@@ -117,17 +124,19 @@ def draw(
             "depth_store_op": "store",
         },
     )
-    drawing.set_pipeline(pipeline)
 
     def buffer(data: bytes | np.ndarray, usage: int) -> Any:
         return device.create_buffer_with_data(data=data, usage=usage)
 
     shared = {at: {"buffer": buffer(data, BufferUsage.UNIFORM | BufferUsage.STORAGE)} for at, data in uniforms.items()}
     shared |= {at: _view(image) for at, image in light.items()} | {6: _sampler()}
-    drawing.set_bind_group(0, _group(pipeline, 0, shared))
-    for mesh in meshes:
-        maps = dict(enumerate(map(_view, mesh.maps), start=1))
-        own = {0: {"buffer": buffer(mesh.material, BufferUsage.UNIFORM)}, **maps, 4: _sampler(mesh.wrap)}
+    for mesh in (*opaque, *([veil] if veil else [])):
+        pipeline = _pipeline(mesh.stages, colour=veil is None or mesh is veil)
+        drawing.set_pipeline(pipeline)
+        drawing.set_bind_group(0, _group(pipeline, 0, shared))
+        maps = {at: _view(image) for at, image in zip((1, 2, 3, 5), mesh.maps, strict=True) if image is not None}
+        own = {0: {"buffer": buffer(mesh.material, BufferUsage.UNIFORM)}} | maps
+        own |= {4: _sampler(mesh.wrap)} if maps else {}
         drawing.set_bind_group(1, _group(pipeline, 1, own))
         drawing.set_vertex_buffer(0, buffer(mesh.vertices, BufferUsage.VERTEX))
         drawing.set_index_buffer(buffer(mesh.indices, BufferUsage.INDEX), "uint32")
@@ -137,6 +146,27 @@ def draw(
     layout = {"bytes_per_row": width * 16, "rows_per_image": height}
     data = device.queue.read_texture({"texture": picture}, layout, (width, height, 1))
     return np.frombuffer(data, np.float32).reshape(height, width, 4)
+
+
+@functools.cache
+def _pipeline(stages: tuple[Stage, Stage], colour: bool) -> Any:
+    """A pipeline that writes depth, and colour if it is asked to."""
+    vertex, fragment = (
+        {"module": _device().create_shader_module(code=stage.code), "entry_point": stage.entry} for stage in stages
+    )
+    formats = [f"float32x{count}" for count in (3, 3, 2, 2, 4, 2, 2, 4)]
+    offsets = (0, 12, 24, 32, 40, 56, 64, 72)
+    attributes = [
+        {"shader_location": k, "offset": at, "format": of}
+        for k, (at, of) in enumerate(zip(offsets, formats, strict=True))
+    ]
+    target = {"format": "rgba32float", "write_mask": 15 if colour else 0}
+    return _device().create_render_pipeline(
+        layout="auto",
+        vertex=vertex | {"buffers": [{"array_stride": 88, "attributes": attributes}]},
+        fragment=fragment | {"targets": [target]},
+        depth_stencil={"format": "depth32float", "depth_write_enabled": True, "depth_compare": "less"},
+    )
 
 
 def _group(pipeline: Any, number: int, resources: Mapping[int, Any]) -> Any:

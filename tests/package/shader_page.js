@@ -89,11 +89,12 @@ async function compiled(code) {
 // Throws unless a program makes a pipeline with the vertices of surface.wgsl.
 window.checkExample = async (code) => {
   const { device, module } = await compiled(code);
-  const formats = ["float32x3", "float32x3", "float32x2", "float32x2"];
-  const attributes = formats.map((format, k) => ({ format, shaderLocation: k, offset: [0, 12, 24, 32][k] }));
+  const formats = "float32x3 float32x3 float32x2 float32x2 float32x4 float32x2 float32x2 float32x4".split(" ");
+  const offsets = [0, 12, 24, 32, 40, 56, 64, 72];
+  const attributes = formats.map((format, k) => ({ format, shaderLocation: k, offset: offsets[k] }));
   await device.createRenderPipelineAsync({
     layout: "auto",
-    vertex: { module, buffers: [{ arrayStride: 40, attributes }] },
+    vertex: { module, buffers: [{ arrayStride: 88, attributes }] },
     fragment: { module, targets: [{ format: "rgba16float" }] },
   });
   device.destroy();

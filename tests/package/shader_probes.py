@@ -15,7 +15,7 @@ import numpy as np
 from kiln_workers.package import shaders
 
 POINTS: Final = 512
-COLUMNS: Final = 13
+COLUMNS: Final = 16
 LOBES: Final = 4
 ALPHAS: Final = (0.01, 0.16, 0.49, 1.0)
 MIPS: Final = 4
@@ -49,7 +49,10 @@ _PROBES: Final = {
         "vec4(fetched.amplitude, 0.0)",
     ],
     "lkLobeSum": ["vec4(lkLobeSum(tLightField, lobes, uv, v), 0.0)"],
+    "lkMappedNormal": ["vec4(lkMappedNormal(n, vec4(x, handedness), texel, dielectric.y, o), 0.0)"],
     "lkF0": ["vec4(lkF0(surface), 0.0)"],
+    "lkF90": ["vec4(lkF90(surface), 0.0, 0.0, 0.0)"],
+    "lkDielectric": ["lkDielectric(ior, dielectric.w, tint, dielectric.x)"],
     "lkReflectance": ["vec4(lkReflectance(surface, o), 0.0)"],
     "lkSurfaceReflection": ["vec4(lkSurfaceReflection(surface, o).peak.z, 0.0)"],
     "lkInterreflection": ["vec4(lkInterreflection(tLightField, lobes, uv, surface, o), 0.0)"],
@@ -82,10 +85,16 @@ vec3 x = given(index, 8).xyz;
 vec3 y = given(index, 9).xyz;
 vec3 z = given(index, 10).xyz;
 LkAnisotropicLobe wide = LkAnisotropicLobe(x, y, z, sharpness, given(index, 6).w);
-LkSurface surface = LkSurface(n, given(index, 11).xyz, given(index, 11).w, roughness);
+vec4 dielectric = given(index, 13);
+LkSurface surface = LkSurface(n, given(index, 11).xyz, given(index, 11).w, roughness, dielectric);
+vec3 tint = given(index, 14).xyz;
+float ior = given(index, 14).w;
+vec3 texel = given(index, 15).xyz;
+float handedness = given(index, 15).w;
 vec3 light = given(index, 12).xyz;
 LkAnisotropicLobe made = lkReflectionLobe(n, x, y, z, alpha, 1.0);
-LkReflection reflection = lkReflection(n, o, alpha, max(lkF0(surface).x, max(lkF0(surface).y, lkF0(surface).z)));
+float f0 = max(lkF0(surface).x, max(lkF0(surface).y, lkF0(surface).z));
+LkReflection reflection = lkReflection(n, o, alpha, f0, lkF90(surface));
 LkLobe fetched = lkFetchLobe(tLightField, uv, k);
 """
 
@@ -138,8 +147,8 @@ LkAnisotropicLobe makeAnisotropicLobe(float3 x, float3 y, float3 z, float2 sharp
   return made;
 }}
 
-LkSurface makeSurface(float3 normal, float3 baseColor, float metallic, float roughness) {{
-  LkSurface made = {{ normal, baseColor, metallic, roughness }};
+LkSurface makeSurface(float3 normal, float3 baseColor, float metallic, float roughness, float4 dielectric) {{
+  LkSurface made = {{ normal, baseColor, metallic, roughness, dielectric }};
   return made;
 }}
 
@@ -301,7 +310,14 @@ def inputs() -> dict[str, np.ndarray]:
         "base_color": random.uniform(0.0, 1.0, (POINTS, 3)),
         "metallic": np.clip(random.uniform(-0.3, 1.3, POINTS), 0.0, 1.0),
         "light": logarithmic(0.001, 100.0, 3),
+        # Half of them as glTF's core has it; else any, some without a specular layer.
+        "dielectric": now_and_then(random.uniform(0.0, 0.9, (POINTS, 4)), 2, (0.04, 0.04, 0.04, 1.0)),
+        "tint": logarithmic(0.1, 10.0, 3),
+        "texel": now_and_then(random.uniform(0.0, 1.0, (POINTS, 3)), 30, 0.5),
+        "handedness": np.where(np.arange(POINTS) % 3, 1.0, -1.0),
+        "ior": now_and_then(random.uniform(1.0, 3.0, POINTS), 10, 1e9),
     }
+    given["dielectric"][1::20] = 0.0
     # Lobes that look where the point looks, or nearly all would have no light to compare there.
     near = np.arange(POINTS) % 3 > 0
     for name, towards in (("a_axis", v), ("b_axis", given["a_axis"])):
@@ -331,6 +347,9 @@ def packed(given: Mapping[str, np.ndarray]) -> np.ndarray:
         ("z", None),
         ("base_color", "metallic"),
         ("light", None),
+        ("dielectric", None),
+        ("tint", "ior"),
+        ("texel", "handedness"),
     ]
     out = np.zeros((POINTS, COLUMNS, 4), np.float32)
     for column, names in enumerate(columns):

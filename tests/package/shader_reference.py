@@ -5,6 +5,8 @@ import shader_probes
 import torch
 
 from kiln_workers.package.half import layers_to_lobes
+from kiln_workers.scene import normal_maps
+from kiln_workers.scene.model import Material
 from kiln_workers.shade import algorithm, textures
 from kiln_workers.shade.package import EnvironmentLookup, LobeTextures
 from kiln_workers.sphere import gaussian
@@ -17,7 +19,9 @@ def reference(given: dict[str, np.ndarray], images: dict[str, shader_probes.Imag
     levels = {name: [torch.from_numpy(level).double() for level in image.levels] for name, image in images.items()}
     lobe_maps = [layers_to_lobes(images[name].levels[0]) for name in ("tLightField", "tVisibility")]
     light = LobeTextures(*(torch.from_numpy(lobes).double() for lobes in lobe_maps))
-    surface = algorithm.Surface(at["n"], at["o"], at["base_color"], at["metallic"], at["roughness"] ** 2)
+    surface = algorithm.Surface(
+        at["n"], at["o"], at["base_color"], at["metallic"], at["roughness"] ** 2, at["dielectric"]
+    )
     kernels = algorithm.reflection_kernels(surface)
     towards = algorithm.glossy_direction(surface)
     albedo = algorithm.reflectance(surface)
@@ -59,7 +63,10 @@ def reference(given: dict[str, np.ndarray], images: dict[str, shader_probes.Imag
         "lkEnvironmentGgx": [torch.lerp(mips[below, points], mips[below + 1, points], (lod - below)[:, None])],
         "lkFetchLobe": [fetched[:, :3], fetched[:, 3], fetched[:, 4:]],
         "lkLobeSum": [LobeTextures(light.light_field, light.light_field).visibility(at["uv"], at["v"])],
+        "lkMappedNormal": [_mapped_normals(given)],
         "lkF0": [algorithm.specular_f0(surface)],
+        "lkF90": [algorithm.specular_f90(surface)],
+        "lkDielectric": [np.array([_dielectric(given, point) for point in range(len(lod))])],
         "lkReflectance": [albedo],
         "lkSurfaceReflection": [kernels[0].z],
         "lkInterreflection": [light.reflected(at["uv"], surface) * albedo],
@@ -69,6 +76,21 @@ def reference(given: dict[str, np.ndarray], images: dict[str, shader_probes.Imag
         "lkEnvironmentSplitSum": [at["light"] * seen * albedo],
         "lkDiffuse": [algorithm.diffuse(surface, textures.bilinear(levels["tIrradiance"][0][0, ..., :3], at["uv"]))],
     }
+
+
+def _mapped_normals(given: dict[str, np.ndarray]) -> np.ndarray:
+    tangent = np.concatenate([given["x"], given["handedness"][:, None]], axis=-1)
+    mapped = normal_maps.mapped(given["n"], tangent, given["texel"], given["dielectric"][:, 1:2])
+    return normal_maps.facing(mapped, given["o"])
+
+
+def _dielectric(given: dict[str, np.ndarray], point: int) -> tuple[float, ...]:
+    """F0 and F90 of a point's material."""
+    coat, _, _, specular = given["dielectric"][point]
+    material = Material(
+        "", ior=given["ior"][point], specular=specular, specular_color=tuple(given["tint"][point]), clearcoat=coat
+    )
+    return (*material.dielectric_f0, material.dielectric_f90)
 
 
 def rounding(given: dict[str, np.ndarray], function: str) -> np.ndarray:

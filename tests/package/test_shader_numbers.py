@@ -76,4 +76,4 @@ def test_twins_have_the_same_structures(language: str) -> None:
         return {name: re.findall(field, body, flags=re.M) for name, body in found}
 
     assert structures(language) == structures("glsl")
-    assert structures("glsl")["LkSurface"] == ["normal", "baseColor", "metallic", "roughness"]
+    assert structures("glsl")["LkSurface"] == ["normal", "baseColor", "metallic", "roughness", "dielectric"]

@@ -19,6 +19,7 @@ from kiln_workers.package.half import lobes_to_layers, to_half
 from kiln_workers.render.environment import environment_u, ggx_prefilter, panorama
 from kiln_workers.scene.examples import courtyard_scene, gallery_scene
 from kiln_workers.scene.model import Environment, Image, Material, Mesh, Scene, TextureRef
+from kiln_workers.scene.tangents import with_tangents
 
 SCREENSHOTS = Path("test-artifacts/viewer")
 ALPHAS = (0.01, 0.16, 0.49, 1.0)
@@ -168,6 +169,52 @@ def veils_scene() -> Scene:
     return Scene(meshes, materials, images, environment=Environment(pixels, 1.0, 70.0))
 
 
+def bumps_scene() -> Scene:
+    """Normal maps (repeated, of another UV set, mirrored, on a curved surface, from behind) and dielectric layers."""
+    slopes = np.sin(np.indices((16, 16)) * (2.0 * np.pi / 16.0))
+    vectors = np.stack([0.6 * slopes[1], 0.6 * slopes[0], np.ones((16, 16))], axis=-1)
+    vectors /= np.linalg.norm(vectors, axis=-1, keepdims=True)
+    images = (Image("bumps", np.round(255.0 * (0.5 + 0.5 * vectors)).astype(np.uint8), False),)
+    turned = TextureRef(0, ("mirror", "mirror"), (0.1, 0.3), (2.0, -1.5), 0.4, 1)
+    materials = (
+        Material("cobbles", roughness=0.4, normal_texture=TextureRef(0, scale=(3.0, 2.0))),
+        Material("hammered", metallic=0.8, roughness=0.4, normal_texture=turned, normal_scale=0.7),
+        Material("foil", (0.9, 0.5, 0.2, 1.0), metallic=1.0, roughness=0.5, double_sided=True,
+                 normal_texture=TextureRef(0)),
+        Material("lacquer", (0.5, 0.05, 0.05, 1.0), roughness=0.4, clearcoat=0.9, specular=0.2),
+        Material("gem", (0.1, 0.4, 0.2, 1.0), roughness=0.4, ior=2.2, specular_color=(0.6, 1.0, 1.4)),
+        Material("pillar", (0.7, 0.7, 0.8, 1.0), roughness=0.5, normal_texture=TextureRef(0, scale=(2.0, 2.0))),
+    )  # fmt: skip
+    wall = _quad("wall", 1, (-2, 0, -1.5), (4, 0, 0), (0, 2, 0), (0.55, 0.05, 0.4))
+    wall = replace(wall, more_uv=(np.float32([[0, 2], [3, 2], [3, 0], [0, 0]]),))
+    meshes = (
+        _quad("floor", 0, (-2, 0, 1.5), (4, 0, 0), (0, 0, -3), (0.05, 0.05, 0.4)),
+        wall,
+        _quad("back of foil", 2, (1.7, 0.1, 0.4), (-0.7, 0, 0.4), (0, 0.9, 0.2), (0.05, 0.78, 0.18)),
+        _quad("lacquer", 3, (0.0, 0.1, -0.4), (0.8, 0, 0.2), (0, 0.9, 0), (0.3, 0.55, 0.2)),
+        _quad("gem", 4, (-1.6, 0.2, -0.6), (0.7, 0, 0.2), (0, 0.8, 0), (0.05, 0.55, 0.2)),
+        _pillar("pillar", 5, (-0.5, 0.0, 0.3), 0.3, 1.2, (0.55, 0.55, 0.3)),
+    )
+    pixels = np.linspace(0.2, 2.0, 16 * 32 * 3, dtype=np.float32).reshape(16, 32, 3)
+    return with_tangents(Scene(meshes, materials, images, environment=Environment(pixels, 1.0, 70.0)))
+
+
+def _pillar(name: str, material: int, foot, radius: float, height: float, cell) -> Mesh:
+    """The front half of a round pillar, its normals smooth and its coordinates mirrored at the middle."""
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 17)
+    normals = np.stack([np.sin(angle), np.zeros(17), np.cos(angle)], axis=1)
+    positions = np.concatenate([foot + radius * normals, foot + radius * normals + (0, height, 0)])
+    pair = np.array([[0, 1, 18], [0, 18, 17]], np.int32)
+    faces = (np.arange(16, dtype=np.int32)[:, None, None] + pair).reshape(-1, 3)
+    along = np.linspace(0.0, 1.0, 17)
+    uv = np.stack([np.tile(2.0 * np.abs(along - 0.5), 2), np.repeat([1.0, 0.0], 17)], axis=1)
+    lightmap = np.array(cell[:2]) + cell[2] * np.stack([np.tile(along, 2), np.repeat([0.0, 1.0], 17)], axis=1)
+    arrays = (positions, np.tile(normals, (2, 1)))
+    return Mesh(
+        name, *(x.astype(np.float32) for x in arrays), faces, material, *(np.float32(x) for x in (uv, lightmap))
+    )
+
+
 def room_scene() -> Scene:
     """A closed room of 4 x 2.5 x 6 m with a solid block in its middle; its walls are seen from inside only."""
     walls = (
@@ -230,12 +277,19 @@ def courtyard() -> Scene:
     return replace(scene, environment=Environment(np.minimum(scene.environment.pixels, 50.0)[::8, ::8].copy()))
 
 
-SCENES = {"gallery": gallery_scene, "courtyard": courtyard, "cabinet": cabinet_scene, "veils": veils_scene}
+SCENES = {
+    "gallery": gallery_scene,
+    "courtyard": courtyard,
+    "cabinet": cabinet_scene,
+    "veils": veils_scene,
+    "bumps": bumps_scene,
+}
 CAMERAS = {
     "gallery": "0.5,2.6,8.5:0,1,-1:42",
     "courtyard": "3,4,9:0,1,0:45",
     "cabinet": "0.4,1.6,4.2:0,0.7,-0.5:45",
     "veils": "0.4,1.6,4.2:0,0.7,-0.5:45",
+    "bumps": "0.4,1.6,4.2:0,0.7,-0.5:45",
 }
 
 

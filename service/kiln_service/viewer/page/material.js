@@ -74,16 +74,27 @@ export function makeMaterial(described, geometry, shaders, shared, environment) 
     uAlphaCutoff: { value: described.alphaTest },
     uDoubleSided: { value: described.side === THREE.DoubleSide },
     uTransmission: { value: described.transmission ?? 0 },
+    uIor: { value: described.ior ?? 1.5 },
+    uSpecular: { value: described.specularIntensity ?? 1 },
+    uSpecularColor: { value: described.specularColor ?? new THREE.Color(1, 1, 1) },
+    uNormalScale: { value: described.normalScale?.x ?? 1 },
+    uClearcoat: { value: described.clearcoat ?? 0 },
   };
-  const maps = { BASE_COLOR: "map", METALLIC_ROUGHNESS: "roughnessMap", EMISSION: "emissiveMap" };
-  const names = { BASE_COLOR: "uBaseColor", METALLIC_ROUGHNESS: "uMetallicRoughness", EMISSION: "uEmission" };
-  for (const [define, key] of Object.entries(maps)) {
+  // scene.glb has tangents wherever it has a normal map.
+  const normalMap = geometry.attributes.tangent ? "normalMap" : null;
+  const maps = {
+    BASE_COLOR: ["map", "uBaseColor"],
+    METALLIC_ROUGHNESS: ["roughnessMap", "uMetallicRoughness"],
+    NORMAL: [normalMap, "uNormal"],
+    EMISSION: ["emissiveMap", "uEmission"],
+  };
+  for (const [define, [key, name]] of Object.entries(maps)) {
     const texture = described[key];
     if (!texture) continue;
     defines[`LK_${define}_MAP`] = "";
     if (texture.channel > 1) defines[`LK_${define}_UV`] = `vTexCoord${texture.channel}`;
-    own[`${names[define]}Map`] = { value: texture };
-    own[`${names[define]}Transform`] = { value: textureTransform(texture) };
+    own[`${name}Map`] = { value: texture };
+    own[`${name}Transform`] = { value: textureTransform(texture) };
   }
   const fragment = [...INCLUDES, "surface.frag.glsl"].map((name) => shaders[name]).join("\n");
   return new THREE.RawShaderMaterial({
@@ -110,8 +121,8 @@ function textureTransform({ offset, repeat, rotation }) {
 
 // The attributes under the names that the package's vertex shader reads.
 export function nameAttributes(geometry) {
-  const { position, normal, uv, uv1, uv2, uv3, color } = geometry.attributes;
+  const { position, normal, tangent, uv, uv1, uv2, uv3, color } = geometry.attributes;
   const named = { aPosition: position, aNormal: normal, aTexCoord0: uv, aTexCoord1: uv1, aColor: color };
-  Object.assign(named, { aTexCoord2: uv2, aTexCoord3: uv3 ?? uv2 });
+  Object.assign(named, { aTangent: tangent, aTexCoord2: uv2, aTexCoord3: uv3 ?? uv2 });
   for (const [name, attribute] of Object.entries(named)) if (attribute) geometry.setAttribute(name, attribute);
 }

@@ -10,6 +10,7 @@ struct LkSurface {
   vec3 baseColor;
   float metallic;
   float roughness;
+  vec4 dielectric;  // F0 of the dielectric, then its F90: 0.04, 0.04, 0.04, 1 unless extensions say otherwise
 };
 
 // Fetch lobe `index`, bilinearly interpolated between texels: layer 2k holds axis and sharpness, 2k + 1 the amplitude.
@@ -28,9 +29,34 @@ vec3 lkLobeSum(sampler2DArray lobes, int count, vec2 uv, vec3 direction) {
   return sum;
 }
 
+// The shading normal that a texel (0 to 1) of a glTF normal map stands for, seen from o. n is the surface's normal on the
+// side of the eye; tangent is TANGENT, whose w is its handedness, and times -1 where the back is seen. The bitangent
+// points up in the image. A normal that would face away is bent towards the eye.
+vec3 lkMappedNormal(vec3 n, vec4 tangent, vec3 texel, float scale, vec3 o) {
+  vec3 t = tangent.xyz - dot(tangent.xyz, n) * n;
+  t *= inversesqrt(max(dot(t, t), 1e-12));
+  vec3 b = tangent.w * cross(n, t);
+  vec3 m = (2.0 * texel - 1.0) * vec3(scale, scale, 1.0);
+  vec3 mapped = normalize(m.x * t + m.y * b + max(m.z, 1e-3) * n);
+  return normalize(mapped + max(0.05 - dot(mapped, o), 0.0) * o);
+}
+
 // Reflectance at normal incidence of a glTF metallic-roughness surface.
 vec3 lkF0(LkSurface surface) {
-  return mix(vec3(0.04), surface.baseColor, surface.metallic);
+  return mix(surface.dielectric.rgb, surface.baseColor, surface.metallic);
+}
+
+// Reflectance at grazing incidence.
+float lkF90(LkSurface surface) {
+  return mix(surface.dielectric.a, 1.0, surface.metallic);
+}
+
+// F0 and F90 of a dielectric (KHR_materials_ior and _specular); a coat's reflectance (_clearcoat) is added to them.
+vec4 lkDielectric(float ior, float specular, vec3 specularColor, float clearcoat) {
+  float ratio = (ior - 1.0) / (ior + 1.0);
+  vec3 f0 = min(ratio * ratio * specularColor, 1.0) * specular;
+  float coat = 0.04 * clearcoat;
+  return vec4(f0 + (1.0 - f0) * coat, specular + (1.0 - specular) * clearcoat);
 }
 
 // The single-scattering albedo. The paper takes F and G at the specular direction instead (step 5 of section 6), which
@@ -38,13 +64,14 @@ vec3 lkF0(LkSurface surface) {
 vec3 lkReflectance(LkSurface surface, vec3 o) {
   float x = clamp(dot(surface.normal, o), 1e-4, 1.0);
   vec2 ab = lkAlbedoTerms(x, surface.roughness * surface.roughness);
-  return lkF0(surface) * ab.x + ab.y;
+  return lkF0(surface) * ab.x + lkF90(surface) * ab.y;
 }
 
 // What a surface gathers light with.
 LkReflection lkSurfaceReflection(LkSurface surface, vec3 o) {
   vec3 f0 = lkF0(surface);
-  return lkReflection(surface.normal, o, surface.roughness * surface.roughness, max(f0.x, max(f0.y, f0.z)));
+  float alpha = surface.roughness * surface.roughness;
+  return lkReflection(surface.normal, o, alpha, max(f0.x, max(f0.y, f0.z)), lkF90(surface));
 }
 
 // Glossy reflection of the scene: the mean of each lobe of the light field under D G F (n.i) (steps 3 to 6 of section 6).
@@ -79,10 +106,12 @@ vec3 lkEnvironmentSplitSum(sampler2DArray visibility, int count, vec2 uv, LkSurf
   return mean * lkLobeSum(visibility, count, uv, lkGlossyDirection(surface, o)) * lkReflectance(surface, o);
 }
 
-// Diffuse reflection of the baked irradiance (W/m^2), without what the specular layer reflects: 1 - F(o.h) averaged over
-// the hemisphere is 0.959 - 0.0266 (1 - o.n)^3 within 0.001.
+// Diffuse reflection of the baked irradiance (W/m^2), without what the specular layer reflects: (1 - o.h)^5 averaged over
+// the hemisphere is (0.00097 + 0.02659 (1 - o.n)^3) / 0.96 within 0.001.
 vec3 lkDiffuse(sampler2D irradiance, vec2 uv, LkSurface surface, vec3 o) {
   float away = 1.0 - clamp(dot(surface.normal, o), 0.0, 1.0);
-  float transmitted = 0.95903 - 0.02659 * away * away * away;
+  float mean = (0.00097 + 0.02659 * away * away * away) / 0.96;
+  float f0 = max(surface.dielectric.x, max(surface.dielectric.y, surface.dielectric.z));
+  float transmitted = 1.0 - f0 - (surface.dielectric.w - f0) * mean;
   return texture(irradiance, uv).rgb * surface.baseColor * (1.0 - surface.metallic) * transmitted / LK_PI;
 }

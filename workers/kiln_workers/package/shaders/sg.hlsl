@@ -99,7 +99,7 @@ float2 lkAlbedoTerms(float x, float alpha) {
 // The reflection of a GGX surface seen from the unit direction o. Its lobes' axes leave the specular direction for the
 // normal as alpha grows and the view lowers; tilts, sharpnesses and shares are polynomials in o.n and alpha, fitted to the
 // microfacet model. The paper's eq. 17 and 18 (Wang et al. 2009) hold for smooth surfaces seen from above only.
-LkReflection lkReflection(float3 n, float3 o, float alpha, float f0) {
+LkReflection lkReflection(float3 n, float3 o, float alpha, float f0, float f90) {
   float x = clamp(dot(n, o), 1e-4, 1.0);
   float y = clamp(alpha, 0.04, 1.0);
   float3 peak = float3(3.6777, 5.49, -0.021158);
@@ -144,7 +144,7 @@ LkReflection lkReflection(float3 n, float3 o, float alpha, float f0) {
   dullTail += float4(-1.2706, 2.8032, 0.73681, 0.4454) * (x * x * x);
   // Schlick's F of any F0 is a sum of 1 and of that of 0.04: the parameters are mixed by what each part reflects.
   float2 ab = lkAlbedoTerms(x, y);
-  float part = (1.0 - f0) / 0.96 * (0.04 * ab.x + ab.y) / max(f0 * ab.x + ab.y, 1e-6);
+  float part = (f90 - f0) / 0.96 * (0.04 * ab.x + ab.y) / max(f0 * ab.x + f90 * ab.y, 1e-6);
   float share = clamp(part, 0.0, 1.0);
   peak = lerp(peak, dullPeak, share);
   tail = lerp(tail, dullTail, share);

@@ -103,7 +103,7 @@ fn lkAlbedoTerms(x: f32, alpha: f32) -> vec2f {
 // The reflection of a GGX surface seen from the unit direction o. Its lobes' axes leave the specular direction for the
 // normal as alpha grows and the view lowers; tilts, sharpnesses and shares are polynomials in o.n and alpha, fitted to the
 // microfacet model. The paper's eq. 17 and 18 (Wang et al. 2009) hold for smooth surfaces seen from above only.
-fn lkReflection(n: vec3f, o: vec3f, alpha: f32, f0: f32) -> LkReflection {
+fn lkReflection(n: vec3f, o: vec3f, alpha: f32, f0: f32, f90: f32) -> LkReflection {
   let x = clamp(dot(n, o), 1e-4, 1.0);
   let y = clamp(alpha, 0.04, 1.0);
   var peak = vec3f(3.6777, 5.49, -0.021158);
@@ -148,7 +148,7 @@ fn lkReflection(n: vec3f, o: vec3f, alpha: f32, f0: f32) -> LkReflection {
   dullTail += vec4f(-1.2706, 2.8032, 0.73681, 0.4454) * (x * x * x);
   // Schlick's F of any F0 is a sum of 1 and of that of 0.04: the parameters are mixed by what each part reflects.
   let ab = lkAlbedoTerms(x, y);
-  let part = (1.0 - f0) / 0.96 * (0.04 * ab.x + ab.y) / max(f0 * ab.x + ab.y, 1e-6);
+  let part = (f90 - f0) / 0.96 * (0.04 * ab.x + ab.y) / max(f0 * ab.x + f90 * ab.y, 1e-6);
   let share = clamp(part, 0.0, 1.0);
   peak = mix(peak, dullPeak, share);
   tail = mix(tail, dullTail, share);

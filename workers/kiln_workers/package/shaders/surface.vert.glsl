@@ -1,5 +1,6 @@
 // Vertex stage of an example program: scene.glb in world space. GLSL ES 3.00. Define LK_VERTEX_COLOR where the mesh has
-// COLOR_0, and LK_MORE_TEX_COORDS where its material's textures use TEXCOORD_2 or TEXCOORD_3.
+// COLOR_0, LK_NORMAL_MAP where its material has a normal texture, and LK_MORE_TEX_COORDS where textures use TEXCOORD_2 or
+// TEXCOORD_3.
 
 uniform mat4 uViewProjection;
 
@@ -8,6 +9,10 @@ in vec3 aNormal;
 in vec2 aTexCoord0;
 in vec2 aTexCoord1;
 
+#ifdef LK_NORMAL_MAP
+in vec4 aTangent;
+out vec4 vTangent;
+#endif
 #ifdef LK_VERTEX_COLOR
 in vec4 aColor;
 out vec4 vColor;
@@ -29,6 +34,9 @@ void main() {
   vNormal = aNormal;
   vTexCoord = aTexCoord0;
   vLightmap = aTexCoord1;
+#ifdef LK_NORMAL_MAP
+  vTangent = aTangent;
+#endif
 #ifdef LK_VERTEX_COLOR
   vColor = aColor;
 #endif

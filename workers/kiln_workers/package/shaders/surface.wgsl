@@ -2,7 +2,9 @@
 // environment.wgsl and lightkiln.wgsl.
 //
 // WGSL has no preprocessor: bind a white texel where the material has no texture (colours are sampled linear; transforms
-// are those of KHR_texture_transform), and where the package has no environment any texel with visibilityLobes = 0.
+// are those of KHR_texture_transform), a white vertex where the mesh has no COLOR_0, any set where it lacks a further one,
+// normalScale = 0 where it has no normal map, and where the package has no environment any texel with visibilityLobes = 0. Where `blend` is set, for BLEND and
+// KHR_materials_transmission, a part of the light behind is seen: then the colour comes multiplied by its alpha.
 // Matrices multiply columns; front faces are counter-clockwise, as in glTF.
 
 struct View {
@@ -20,9 +22,18 @@ struct Material {
   roughness: f32,
   alphaCutoff: f32,
   doubleSided: u32,
+  blend: u32,
+  specularColor: vec3f,  // KHR_materials_specular: 1, 1, 1 without it
+  specular: f32,  // and 1
+  ior: f32,  // KHR_materials_ior: 1.5
+  clearcoat: f32,  // KHR_materials_clearcoat: 0
+  transmission: f32,
+  normalScale: f32,
+  uvSets: vec4u,  // of base colour, metallic and roughness, emission, normal: 0 is TEXCOORD_0, 1 TEXCOORD_2, 2 TEXCOORD_3
   baseColorTransform: mat3x3f,
   metallicRoughnessTransform: mat3x3f,
   emissionTransform: mat3x3f,
+  normalTransform: mat3x3f,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -37,12 +48,17 @@ struct Material {
 @group(1) @binding(2) var metallicRoughnessMap: texture_2d<f32>;
 @group(1) @binding(3) var emissionMap: texture_2d<f32>;
 @group(1) @binding(4) var materialSampler: sampler;
+@group(1) @binding(5) var normalMap: texture_2d<f32>;
 
 struct Vertex {
   @location(0) position: vec3f,
   @location(1) normal: vec3f,
   @location(2) texCoord: vec2f,
   @location(3) lightmap: vec2f,
+  @location(4) color: vec4f,
+  @location(5) texCoord2: vec2f,
+  @location(6) texCoord3: vec2f,
+  @location(7) tangent: vec4f,
 }
 
 struct Fragment {
@@ -51,11 +67,18 @@ struct Fragment {
   @location(1) normal: vec3f,
   @location(2) texCoord: vec2f,
   @location(3) lightmap: vec2f,
+  @location(4) color: vec4f,
+  @location(5) texCoord2: vec2f,
+  @location(6) texCoord3: vec2f,
+  @location(7) tangent: vec4f,
 }
 
 @vertex fn vertexMain(vertex: Vertex) -> Fragment {
   let clip = view.viewProjection * vec4f(vertex.position, 1.0);
-  return Fragment(clip, vertex.position, vertex.normal, vertex.texCoord, vertex.lightmap);
+  return Fragment(
+    clip, vertex.position, vertex.normal, vertex.texCoord, vertex.lightmap, vertex.color, vertex.texCoord2,
+    vertex.texCoord3, vertex.tangent,
+  );
 }
 
 // The shading normal on the side of the eye; the triangle's own where the interpolated one faces away.
@@ -68,19 +91,40 @@ fn seenNormal(fragment: Fragment, front: bool, o: vec3f) -> vec3f {
   return select(face, -face, dot(face, o) < 0.0);
 }
 
+// Where a texture is looked up whose coordinates are those of a set.
+fn placeIn(fragment: Fragment, uvSet: u32, transform: mat3x3f) -> vec2f {
+  let uv = select(select(fragment.texCoord3, fragment.texCoord2, uvSet == 1), fragment.texCoord, uvSet == 0);
+  return (transform * vec3f(uv, 1.0)).xy;
+}
+
 @fragment fn fragmentMain(fragment: Fragment, @builtin(front_facing) front: bool) -> @location(0) vec4f {
-  let uv = vec3f(fragment.texCoord, 1.0);
-  let base = material.baseColor
-    * textureSample(baseColorMap, materialSampler, (material.baseColorTransform * uv).xy);
+  let baseAt = placeIn(fragment, material.uvSets.x, material.baseColorTransform);
+  let glossyAt = placeIn(fragment, material.uvSets.y, material.metallicRoughnessTransform);
+  let emissionAt = placeIn(fragment, material.uvSets.z, material.emissionTransform);
+  let base = material.baseColor * fragment.color * textureSample(baseColorMap, materialSampler, baseAt);
   let glossy = vec2f(material.roughness, material.metallic)
-    * textureSample(metallicRoughnessMap, materialSampler, (material.metallicRoughnessTransform * uv).xy).gb;
-  var radiance = material.emission
-    * textureSample(emissionMap, materialSampler, (material.emissionTransform * uv).xy).rgb;
+    * textureSample(metallicRoughnessMap, materialSampler, glossyAt).gb;
+  var radiance = material.emission * textureSample(emissionMap, materialSampler, emissionAt).rgb;
+  let bumpAt = placeIn(fragment, material.uvSets.w, material.normalTransform);
+  let texel = textureSample(normalMap, materialSampler, bumpAt).rgb;
   let o = normalize(view.eye - fragment.position);
+  let side = seenNormal(fragment, front, o);
+  var normal = side;
+  if (material.normalScale != 0.0) {
+    normal = lkMappedNormal(side, fragment.tangent * select(-1.0, 1.0, front), texel, material.normalScale, o);
+  }
   let surface = LkSurface(
-    seenNormal(fragment, front, o), saturate(base.rgb), saturate(glossy.y), saturate(glossy.x),
+    normal, saturate(base.rgb), saturate(glossy.y), saturate(glossy.x),
+    lkDielectric(material.ior, material.specular, material.specularColor, material.clearcoat),
   );
-  radiance += lkDiffuse(irradiance, lightSampler, fragment.lightmap, surface, o);
+  // What is not reflected diffusely goes through, less Fresnel's share and tinted by the base colour; one alpha stands for
+  // the three colours.
+  let kept = material.transmission * (1.0 - surface.metallic);
+  let away = 1.0 - saturate(dot(side, o));
+  let f0 = max(surface.dielectric.x, max(surface.dielectric.y, surface.dielectric.z));
+  let reflectedShare = f0 + (surface.dielectric.w - f0) * away * away * away * away * away;
+  let through = kept * (1.0 - reflectedShare) * dot(surface.baseColor, vec3f(1.0 / 3.0));
+  radiance += (1.0 - kept) * lkDiffuse(irradiance, lightSampler, fragment.lightmap, surface, o);
   radiance += lkInterreflection(lightField, lightSampler, view.lightFieldLobes, fragment.lightmap, surface, o);
   let towards = lkGlossyDirection(surface, o);
   let alpha = surface.roughness * surface.roughness;
@@ -95,5 +139,8 @@ fn seenNormal(fragment: Fragment, front: bool, o: vec3f) -> vec3f {
     radiance = vec3f(0.0);
   }
   // Linear radiance: expose, tone-map and encode in a later pass.
-  return vec4f(radiance, 1.0);
+  if (material.blend == 0) {
+    return vec4f(radiance, 1.0);
+  }
+  return saturate(base.a) * vec4f(radiance, 1.0 - through);
 }
