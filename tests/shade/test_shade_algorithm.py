@@ -190,6 +190,18 @@ def test_means_under_the_kernel_are_those_of_ggx(
     assert error["ggx", "paper"] > 0.5
 
 
+def test_a_lobe_straight_behind_is_not_seen() -> None:
+    """Light from where a surface looks away: no more than a millionth of it, also where no way is the nearest."""
+    degrees = torch.tensor([180.0, 179.0, 178.0, 175.0, 170.0, 150.0], dtype=torch.float64)
+    normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(6, 3)
+    ones = torch.ones(6, dtype=torch.float64)
+    surface = algorithm.Surface(normal, normal, ones[:, None].expand(6, 3), ones, 0.16 * ones)
+    angle = torch.deg2rad(degrees)
+    axis = torch.stack([torch.sin(angle), 0.0 * angle, torch.cos(angle)], dim=-1)
+    lobes = torch.cat([axis, 20.0 * ones[:, None], torch.ones((6, 3), dtype=torch.float64)], dim=-1)[:, None]
+    assert algorithm.mean_under(lobes, algorithm.reflection_kernels(surface)).max() < 1e-6
+
+
 @pytest.mark.parametrize("alpha", [0.09, 0.16, 0.25, 0.5, 1.0])
 def test_a_dielectric_wall_has_no_veil(alpha: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A room's side wall seen at grazing angles: what it reflects of a bright room before it and a dim wall behind.

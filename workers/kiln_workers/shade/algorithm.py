@@ -197,8 +197,11 @@ def _product(lobes: Tensor, kernel: Kernel) -> Tensor:
     """Integral of the lobes times one kernel [P, 3]."""
     nu, lx, ly = 0.5 * lobes[..., 3], kernel.lx[:, None], kernel.ly[:, None]
     x, y, z = ((lobes[..., :3] * axis[:, None]).sum(-1) for axis in (kernel.x, kernel.y, kernel.z))
-    chord = 2.0 / (1.0 + z).clamp(min=1e-2)
-    exponent = (nu * lx / (nu + lx) * x * x + nu * ly / (nu + ly) * y * y) * chord
+    # The chord's square, 2 (1 - z), times the sharpness in its direction; straight behind, the mean of both.
+    behind = torch.where(z > 0.0, 0.0, 1e-6)
+    xx, yy = x * x + behind, y * y + behind
+    chord = torch.where(z > 0.0, 2.0 / (1.0 + z.clamp(min=0.0)), 2.0 * (1.0 - z) / (xx + yy).clamp(min=1e-6))
+    exponent = (nu * lx / (nu + lx) * xx + nu * ly / (nu + ly) * yy) * chord
     width = 0.5 * (lx + ly) + 0.5
     centre = (nu * z + width) * torch.rsqrt((nu * nu + width * width + 2.0 * nu * width * z).clamp(min=1e-9))
     overlap = _cap(nu + lx, nu + ly) * centre.clamp(0.0, 1.0) * torch.exp(-exponent)

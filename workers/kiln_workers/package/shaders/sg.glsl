@@ -167,10 +167,15 @@ vec3 lkConvolve(LkLobe lobe, LkAnisotropicLobe kernel) {
   float x = dot(lobe.axis, kernel.x);
   float y = dot(lobe.axis, kernel.y);
   float z = dot(lobe.axis, kernel.z);
-  float chord = 2.0 / max(1.0 + z, 1e-2);
+  // The chord's square, 2 (1 - z), times the sharpness in its direction; straight behind, the mean of both.
+  float behind = z > 0.0 ? 0.0 : 1e-6;
+  float xx = x * x + behind;
+  float yy = y * y + behind;
+  float chord = z > 0.0 ? 2.0 / (1.0 + z) : 2.0 * (1.0 - z) / (xx + yy);
+  float exponent = (reduced.x * xx + reduced.y * yy) * chord;
   float width = 0.5 * (kernel.sharpness.x + kernel.sharpness.y) + 0.5;
   float centre = (nu * z + width) * inversesqrt(max(nu * nu + width * width + 2.0 * nu * width * z, 1e-9));
-  float overlap = lkCap(sum) * clamp(centre, 0.0, 1.0) * exp(-(reduced.x * x * x + reduced.y * y * y) * chord);
+  float overlap = lkCap(sum) * clamp(centre, 0.0, 1.0) * exp(-exponent);
   return lobe.amplitude * kernel.amplitude * overlap;
 }
 

@@ -174,10 +174,18 @@ fn lkConvolve(lobe: LkLobe, kernel: LkAnisotropicLobe) -> vec3f {
   let x = dot(lobe.axis, kernel.x);
   let y = dot(lobe.axis, kernel.y);
   let z = dot(lobe.axis, kernel.z);
-  let chord = 2.0 / max(1.0 + z, 1e-2);
+  // The chord's square, 2 (1 - z), times the sharpness in its direction; straight behind, the mean of both.
+  let behind = select(1e-6, 0.0, z > 0.0);
+  let xx = x * x + behind;
+  let yy = y * y + behind;
+  var chord = 2.0 / (1.0 + max(z, 0.0));
+  if (z <= 0.0) {
+    chord = 2.0 * (1.0 - z) / (xx + yy);
+  }
+  let exponent = (reduced.x * xx + reduced.y * yy) * chord;
   let width = 0.5 * (kernel.sharpness.x + kernel.sharpness.y) + 0.5;
   let centre = (nu * z + width) * inverseSqrt(max(nu * nu + width * width + 2.0 * nu * width * z, 1e-9));
-  let overlap = lkCap(sum) * saturate(centre) * exp(-(reduced.x * x * x + reduced.y * y * y) * chord);
+  let overlap = lkCap(sum) * saturate(centre) * exp(-exponent);
   return lobe.amplitude * kernel.amplitude * overlap;
 }
 
