@@ -28,7 +28,7 @@ WAYS = {"WebGL2": "glsl", "Tint": "wgsl", "naga": "wgsl", "DXC": "hlsl"}
 BETWEEN_LANGUAGES = 1e-6
 """Largest difference from GLSL over the largest component of GLSL's result; 0 where all share a driver, as here."""
 
-FROM_EVALUATOR = 8e-5
+FROM_EVALUATOR = 4e-5
 """Likewise of GLSL from the evaluator: what 32 bits lose. Sharp lobes lose more (`shader_reference.rounding`)."""
 
 Run = Callable[[str, Mapping[str, str]], np.ndarray]
