@@ -18,12 +18,14 @@ def subject(kept_bake: Path) -> Subject:
 
 
 def test_places_are_the_means_of_the_corners(subject: Subject) -> None:
-    """Exact on parallelograms, whose positions are linear in the light-map UV."""
+    """On parallelograms, whose positions are linear in the light-map UV; but points keep off their chart's edge."""
     chosen = choose_texels(subject, None)
     placed = place_between(subject.scene, chosen.texel_map, chosen.field, 1000, 7)
     positions = subject.store.read_texel_map()["position"][tuple(chosen.field.place.T)]
     assert len(placed.points) == len(chosen.field.between) > 300
-    np.testing.assert_allclose(placed.batch.position, positions[placed.points.corners].mean(axis=1), atol=1e-5)
+    means = positions[placed.points.corners].mean(axis=1)
+    apart = np.linalg.norm(placed.batch.position - means, axis=1) / placed.batch.texel_size
+    assert np.median(apart) < 1e-4 and apart.max() < 0.03
     np.testing.assert_array_equal(placed.batch.normal, chosen.field.normals[placed.points.first])
     again = place_between(subject.scene, chosen.texel_map, chosen.field, 30, 7)
     assert len(again.points) == 90

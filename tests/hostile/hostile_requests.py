@@ -246,7 +246,7 @@ def _routes() -> Iterator[Call]:
         yield Call(f"the range {spec[:20]} is ignored", "GET", f"/v1/blobs/{SHA}", 200, "", None, {"Range": spec})
     yield Call("a cursor that is SQL", "GET", "/v1/jobs?cursor=' OR 1=1 --", 422, "cursor")
     yield Call("a search for U+0000", "GET", "/v1/jobs?q=%00", 422, "U+0000")
-    yield Call("a label that is U+0000", "GET", "/v1/jobs?label=a%3D%00", 422, "U+0000")
+    yield Call("a label that is U+0000", "GET", "/v1/jobs?label=a%3D%00", 422, "is not a label")
     yield Call("a search of 200 letters", "GET", "/v1/jobs?q=" + "x" * 200, 422, "q")
     yield Call("limit 10**30", "GET", f"/v1/jobs?limit={10**30}", 422, "limit")
     yield Call("after 2**64", "GET", f"/v1/jobs/{NOBODY}/events?after={2**64}", 422, "after")
@@ -394,7 +394,7 @@ def _pages() -> Iterator[Call]:
         yield Call(f"page: the texel {place}", "GET", f"/jobs/{NOBODY}/texels/{place}", 422, "")
         yield Call(f"page: the tile {place}", "GET", f"/jobs/{NOBODY}/tiles/{place}", 422, "")
     yield Call("page: the irradiance of no tile", "GET", f"/jobs/{NOBODY}/irradiance", 422, "tile")
-    for path in ("atlas", "texels", "texels/0/0", "tiles/0/0"):
+    for path in ("texels", "texels/0/0", "tiles/0/0"):
         yield Call(f"page: {path} of no job", "GET", f"/jobs/{NOBODY}/{path}", 404, "no ")
         yield Call(f"page: {path} of U+0000", "GET", f"/jobs/%00/{path}", 422, "U+0000")
     yield Call("page: jobs named U+0000", "GET", "/jobs?q=%00", 422, "U+0000")

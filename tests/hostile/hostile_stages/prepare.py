@@ -52,7 +52,8 @@ def _walked() -> Path:
     frame = sys._getframe(2)
     if frame.f_code.co_filename != files.__file__:
         return Path.cwd()
-    return Path(f"/proc/self/fd/{frame.f_locals['walk'][-1]}").readlink()
+    walk = frame.f_locals.get("walk") or [frame.f_locals.get("handle")]
+    return Path.cwd() if walk[-1] is None else Path(f"/proc/self/fd/{walk[-1]}").readlink()
 
 
 sys.addaudithook(_hook)
