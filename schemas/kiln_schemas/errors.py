@@ -215,12 +215,12 @@ def wait_asked(retry_after: str | None) -> float:
 
 
 def error_of_answer(body: bytes, status: int, request: str, where: str) -> KilnError:
-    """The exception that an HTTP answer stands for; InternalError where it is not one of a coordinator's."""
+    """The exception that an HTTP answer stands for; Unreachable where it is not one of a coordinator's."""
     try:
         return KilnError.from_problem(Problem.model_validate_json(body))
     except ValidationError:
-        return InternalError(
-            f"unexpected answer {status} to {request}",
+        return Unreachable(
+            f"what answers there is no coordinator: it answered {request} with {status} and no problem document",
             where=where,
-            remedy="Check that this URL is a lightkiln coordinator.",
+            remedy="Check that this URL is a lightkiln coordinator's.",
         )

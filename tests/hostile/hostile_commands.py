@@ -216,8 +216,8 @@ def run(attempt: Attempt, folder: Path) -> Ended:
     said = output.read().decode(errors="replace")
     output.close()
     ended = Ended(attempt, os.waitstatus_to_exitcode(status) if status is not None else -999, said)
-    # An error that is no problem document is told with 1; where standard error is closed, nobody hears of it.
-    if ended.code not in CODES and not (ended.code == 1 and ("unexpected answer" in said or attempt.closed)):
+    # Where standard error is closed, nobody hears of what is wrong.
+    if ended.code not in CODES and not (ended.code == 1 and attempt.closed):
         ended.problems.append(f"exit code {ended.code}")
     ended.problems += [word for word in ("Traceback", "a defect in lightkiln", "ESCAPED") if word in said]
     if "\x1b[31m\x1b[31m" in said:

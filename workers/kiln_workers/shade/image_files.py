@@ -19,7 +19,11 @@ def check_output(path: Path) -> Path:
     """The path unchanged if a picture can be written in the format that its suffix names; InputError otherwise."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(
-            f"'{path.suffix}' is not a format that is written", where=str(path), remedy=f"Use {' or '.join(SUFFIXES)}."
+            f"'{path.suffix}' is not a format that is written"
+            if path.suffix
+            else "the name has no suffix to say the format",
+            where=str(path),
+            remedy=f"Use {' or '.join(SUFFIXES)}.",
         )
     return path
 
