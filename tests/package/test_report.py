@@ -200,3 +200,25 @@ def test_a_light_map_of_specks_is_not_called_good(make_sample, tmp_path: Path) -
 def test_the_grade_of_a_coarse_light_map(specks: float, word: str) -> None:
     assert report.grade(0.03, specks)[0] == word
     assert report.grade(0.4, specks)[0] == "poor"
+
+
+@pytest.mark.parametrize(
+    ("flip", "noise", "word"),
+    [
+        (0.05, 0.04, "like the reference"),
+        (0.05, 0.0, "close to the reference"),
+        (0.15, 0.05, "visibly different from the reference"),
+        (0.3, 0.05, "plainly different from the reference"),
+    ],
+)
+def test_the_verdict_on_pictures_is_what_noise_does_not_explain(flip: float, noise: float, word: str) -> None:
+    better = GateResult.of("flip.other", flip, 0.2, noise_floor=flip)
+    lobes = GateResult.of("log_mse_rel", 0.9, 0.2)
+    found = report.verdict([better, GateResult.of("flip.front", flip, 0.2, noise_floor=noise), lobes])
+    assert found is not None and (found["word"], found["camera"]) == (word, "front")
+
+
+def test_without_a_picture_nothing_is_said_of_the_look(make_sample, tmp_path: Path) -> None:
+    text, _ = built(tmp_path, make_sample())
+    assert report.verdict([GateResult.of("log_mse_rel", 0.01, 0.2)]) is None
+    assert "Pictures: not compared" in text and "fit of the lobes: " in text

@@ -13,6 +13,7 @@ import jinja2
 import numpy as np
 import numpy.typing as npt
 
+from kiln_schemas.gates import FLIP, GateResult
 from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Artifact, FitMetrics, FitResult
@@ -38,6 +39,14 @@ _GRADES: Final = (
     (0.50, "poor", "poor"),
 )
 """Upper bounds of log_mse_rel, the word for it and its style; from 0.5 on a bake fails (kiln_workers.fit)."""
+
+
+_PICTURE_GRADES: Final = (
+    (0.02, "like the reference", "good"),
+    (0.06, "close to the reference", "good"),
+    (0.12, "visibly different from the reference", "fair"),
+)
+"""Upper bounds of FLIP beyond what the reference's noise makes, the word for it and its style."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +80,7 @@ def render(report: ReportInput) -> bytes:
         manifest=manifest,
         settings=_flat(manifest.settings.model_dump(mode="json")),
         functions=functions,
+        verdict=verdict(manifest.gates),
         views=[
             {"camera": v.camera, "picture": charts.data_uri(v.picture), "reference": charts.data_uri(v.reference)}
             for v in report.views
@@ -82,6 +92,21 @@ def render(report: ReportInput) -> bytes:
         files=sorted(manifest.files, key=_file_order),
     )
     return html.encode("utf-8")
+
+
+def verdict(gates: Sequence[GateResult]) -> dict[str, Any] | None:
+    """What the pictures of FLIP gates say of the bake, by the worst of them; None where none was compared."""
+    pictures = [gate for gate in gates if gate.name.startswith(FLIP)]
+    if not pictures:
+        return None
+    worst = max(pictures, key=lambda gate: gate.value - (gate.noise_floor or 0.0))
+    excess = worst.value - (worst.noise_floor or 0.0)
+    word, style = next(
+        ((word, style) for bound, word, style in _PICTURE_GRADES if excess < bound),
+        ("plainly different from the reference", "poor"),
+    )
+    camera = worst.name.removeprefix(FLIP)
+    return {"word": word, "style": style, "camera": camera, "flip": worst.value, "noise": worst.noise_floor}
 
 
 def grade(log_mse_rel: float, speck_share: float = 0.0) -> tuple[str, str]:
