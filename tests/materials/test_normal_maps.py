@@ -32,6 +32,8 @@ WAYS = {
     # The transform turns coordinates counter-clockwise, hence what is seen clockwise.
     "turned by the transform": (UPRIGHT, {"rotation": pi / 2}, TILT[[1, 0, 2]] * [1, -1, 1]),
     "mirrored by the transform": (UPRIGHT, {"scale": (2.0, -3.0)}, TILT * [1, -1, 1]),
+    # The second set is the first mirrored across.
+    "another set": (UPRIGHT, {"uv_set": 1}, TILT * [-1, 1, 1]),
 }  # fmt: skip
 
 
@@ -40,7 +42,7 @@ def square(material: Material, pixels: np.ndarray, uv: np.ndarray = UPRIGHT, **m
     mesh = Mesh(
         "square", SQUARE, np.tile(np.float32([0, 0, 1]), (4, 1)), FACES, 0, np.float32(uv), SQUARE[:, :2].copy()
     )
-    mesh = replace(mesh, lightmap_uv=0.02 + 0.96 * mesh.lightmap_uv)
+    mesh = replace(mesh, lightmap_uv=0.02 + 0.96 * mesh.lightmap_uv, more_uv=(np.float32(uv * [-1, 1]),))
     image = Image("bumps", pixels.astype(np.float32), False)
     return with_tangents(Scene((mesh,), (material,), (image,), **more))
 

@@ -34,7 +34,9 @@ def transformed(uv: npt.NDArray[np.floating], reference: TextureRef) -> Floats:
     return np.asarray(uv.astype(np.float64) @ matrix[:2, :2].T + matrix[:2, 2])
 
 
-def look_up(pixels: Float32 | Floats, reference: TextureRef, uv: npt.NDArray[np.floating]) -> Floats:
+def look_up(
+    pixels: npt.NDArray[np.uint8] | Float32 | Floats, reference: TextureRef, uv: npt.NDArray[np.floating]
+) -> Floats:
     """Values [P, C] of an image [H, W, C] at a mesh's coordinates [P, 2], bilinear."""
     height, width = pixels.shape[:2]
     at = transformed(uv, reference) * (width, height) - 0.5

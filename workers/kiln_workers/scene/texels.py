@@ -25,7 +25,6 @@ from scipy.sparse.csgraph import connected_components
 
 from kiln_schemas.errors import InputError
 from kiln_workers.render.backend import Device
-from kiln_workers.scene import texel_surface
 from kiln_workers.scene.container import Array
 from kiln_workers.scene.geometry import Floats, Ints, face_areas, face_normals
 from kiln_workers.scene.model import Mesh, Scene
@@ -33,6 +32,7 @@ from kiln_workers.scene.precision import face_clearance
 from kiln_workers.scene.push_out import BareTriangles, push_out
 from kiln_workers.scene.raster import kept_inside, touched_squares
 from kiln_workers.scene.texel_map import TexelMap, TexelState
+from kiln_workers.scene.texel_surface import TexelSurface
 
 MIN_COSINE: Final = 0.05
 """A shading normal is bent towards the geometric one until their cosine is at least this."""
@@ -66,13 +66,8 @@ def rasterise_texels(scene: Scene, resolution: int, device: Device = "auto") -> 
     normal = faces.normal[touched.face]
     flat = np.einsum("sc,scd->sd", weight, faces.positions[corner])
     mesh = faces.mesh[touched.face]
-    squares = texel_surface.Squares(
-        mesh,
-        faces.own_corners[touched.face],
-        weight,
-        texel_surface.gradients(faces.lightmap_uv * resolution)[touched.face],
-    )
-    shading = texel_surface.shading_normals(scene, squares)
+    surface = TexelSurface(scene, touched.face, weight, faces.lightmap_uv * resolution)
+    shading = surface.shading_normals()
     size = sizes[touched.face]
     lift = terminator_offset(flat, weight, faces.positions[corner], faces.normals[corner])
     position = flat + clearance[touched.face, None] * normal
@@ -90,7 +85,7 @@ def rasterise_texels(scene: Scene, resolution: int, device: Device = "auto") -> 
         position=spread(position, np.float32),
         normal=spread(normal, np.float32),
         shading_normal=spread(bent_normals(shading, normal), np.float32),
-        alpha=spread(texel_surface.alpha(scene, squares), np.float32),
+        alpha=spread(surface.alpha(), np.float32),
         texel_size=spread(size, np.float32),
         mesh=spread(mesh, np.int32, -1),
         chart=spread(faces.charts()[touched.face], np.int32, -1),
@@ -136,9 +131,10 @@ class _AllFaces:
         offsets = np.cumsum([0] + [len(mesh.positions) for mesh in scene.meshes])
         self.positions = np.concatenate([mesh.positions for mesh in scene.meshes]).astype(np.float64)
         self.normals = np.concatenate([mesh.normals for mesh in scene.meshes]).astype(np.float64)
-        self.own_corners = np.concatenate([mesh.faces.astype(np.int64) for mesh in scene.meshes])  # [F, 3] in the mesh
+        self.corners = np.concatenate(
+            [mesh.faces.astype(np.int64) + offset for mesh, offset in zip(scene.meshes, offsets, strict=False)]
+        )  # [F, 3]
         self.mesh = np.repeat(np.arange(len(scene.meshes)), [len(mesh.faces) for mesh in scene.meshes])
-        self.corners = self.own_corners + offsets[self.mesh][:, None]  # [F, 3] in all of them
         self._flat_uv = np.concatenate([_lightmap_uv(mesh) for mesh in scene.meshes])
         self.lightmap_uv = self._flat_uv[self.corners].astype(np.float64)  # [F, 3, 2]
         self.normal = face_normals(self.positions, self.corners)
