@@ -119,6 +119,45 @@ def test_materials_textures_and_emission(gltf, tmp_path, write_image):
     assert sum("sheen" in note for note in scene.notes) == 2
 
 
+@pytest.mark.parametrize(
+    ("tangent", "expected"),
+    [
+        ([0.0, 1.0, 0.0, -1.0], [0.0, 1.0, 0.0, -1.0]),
+        (None, [1.0, 0.0, 0.0, 1.0]),
+        ([np.nan, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 1.0]),
+        ([0.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 1.0]),
+    ],
+)
+def test_tangents_are_the_file_s_or_made(gltf, tmp_path, write_image, tangent, expected):
+    """A normal map of TEXCOORD_2, which stands upright; TEXCOORD_0 is turned."""
+    scene = load_scene(tmp_path, bumpy(gltf, tmp_path, write_image, tangent))
+    mesh, material = scene.meshes[0], scene.materials[0]
+    assert material.normal_scale == 0.5 and not scene.images[0].srgb
+    np.testing.assert_allclose(mesh.tangents, np.tile(expected, (3, 1)), atol=1e-6)
+    assert not [note for note in scene.notes if "ormal" in note]
+
+
+def test_tangents_of_a_wrong_shape_are_refused(gltf, tmp_path, write_image):
+    with pytest.raises(InputError, match="TANGENT"):
+        load_scene(tmp_path, bumpy(gltf, tmp_path, write_image, [1.0, 0.0, 0.0]))
+
+
+def bumpy(gltf, folder, write_image, tangent):
+    """A file of the triangle with a normal map, and a tangent that all of its vertices have."""
+    write_image(folder / "bumps.png", np.full((4, 4, 3), 128, np.uint8))
+    more = {} if tangent is None else {"TANGENT": np.tile(np.float32(tangent), (3, 1))}
+    gltf.mesh(
+        material=0,
+        NORMAL=np.float32([[0, 0, 1]] * 3),
+        TEXCOORD_0=np.float32([[0, 0], [0, 1], [1, 0]]),
+        TEXCOORD_2=np.float32([[0, 1], [1, 1], [0, 0]]),
+        **more,
+    )
+    gltf.document["images"], gltf.document["textures"] = [{"uri": "bumps.png"}], [{"source": 0}]
+    gltf.document["materials"] = [{"normalTexture": {"index": 0, "texCoord": 2, "scale": 0.5}}]
+    return gltf.write(folder)
+
+
 def test_punctual_lights_are_placed_by_their_nodes(gltf, tmp_path):
     gltf.mesh()
     gltf.document["extensions"] = {
