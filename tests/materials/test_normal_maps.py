@@ -9,7 +9,9 @@ from rich_scene import rich_scene
 
 from kiln_schemas.camera import Camera
 from kiln_schemas.settings import RenderSettings
-from kiln_workers.render.jit import mi
+from kiln_workers.render.backend import select_variant
+from kiln_workers.render.jit import dr, mi
+from kiln_workers.render.mitsuba_scene import to_mitsuba
 from kiln_workers.render.tile import TexelBatch, TileRenderer
 from kiln_workers.scene import geometry, normal_maps
 from kiln_workers.scene.model import Image, LightKind, Material, Mesh, PunctualLight, Scene, TextureRef
@@ -235,3 +237,35 @@ def test_tangents_are_there_where_they_are_used():
     assert with_tangents(scene).meshes[0].tangents.shape == (4, 4)
     unused = replace(scene.materials[0], normal_texture=None)
     assert with_tangents(replace(with_tangents(scene), materials=(unused,))).meshes[0].tangents is None
+
+
+@pytest.mark.parametrize(("double_sided", "height"), [(False, 1.0), (True, -1.0), (False, 0.08)])
+def test_samples_under_a_map_are_those_of_its_values(double_sided, height):
+    """The mean weight of samples is the integral of the values, and that of 1 / pdf over them the solid angle.
+
+    From above, from behind, and so low that the mapped normal faces away and is bent.
+    """
+    select_variant("cpu")
+    material = Material("m", roughness=0.5, double_sided=double_sided, normal_texture=TextureRef(0))
+    scene = to_mitsuba(square(material, constant([-0.7, 0.0, 0.3])))
+    count = 1 << 18
+    origin = mi.Point3f(1.5, 0.5, height)
+    ray = mi.Ray3f(origin, dr.normalize(mi.Point3f(0.5, 0.5, 0.0) - origin))
+    si = scene.ray_intersect(dr.gather(type(ray), ray, dr.zeros(mi.UInt32, count)))
+    state = mi.PCG32(count)
+    sample, weight = si.bsdf().sample(
+        mi.BSDFContext(), si, state.next_float32(), mi.Point2f(state.next_float32(), state.next_float32())
+    )
+    uniform = mi.warp.square_to_uniform_sphere(mi.Point2f(state.next_float32(), state.next_float32()))
+    value, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, uniform)
+    found = np.array(weight).mean(axis=1)
+    expected = 4.0 * pi * np.array(value).mean(axis=1)
+    assert expected.min() > 0.1
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+    # No sample leaves through the surface, nor is one expected there.
+    through = np.array(uniform)[2] * height < 0.0
+    assert not np.array(pdf)[through].any() and not np.array(value)[:, through].any()
+    drawn = np.array(sample.pdf) > 0.0
+    assert drawn.any() and (np.array(sample.wo)[2][drawn] * height > 0.0).all()
+    again = np.array(si.bsdf().eval_pdf(mi.BSDFContext(), si, sample.wo)[1])
+    np.testing.assert_allclose(again[drawn], np.array(sample.pdf)[drawn], rtol=1e-3)
