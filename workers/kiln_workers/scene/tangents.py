@@ -7,6 +7,7 @@ there) becomes two. The coordinates are those on the image, after KHR_texture_tr
 We deviate where faces of one hand touch in a vertex alone: MikkTSpace keeps them apart.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
@@ -18,6 +19,8 @@ from kiln_workers.scene.model import Mesh, Scene
 
 LEAST_TANGENT: Final = 0.5
 """A vertex whose tangent from the file is shorter has none."""
+BLOCK: Final = 1 << 17
+"""Faces that are worked on at once: bounds memory."""
 
 
 def with_tangents(scene: Scene) -> Scene:
@@ -37,27 +40,38 @@ def _with_tangents(scene: Scene, mesh: Mesh) -> Mesh:
 
 def made(mesh: Mesh, uv: Floats) -> Mesh:
     """The mesh with tangents along growing u; `uv` [V, 2] are coordinates on the image, v down."""
-    corners = mesh.positions.astype(np.float64)[mesh.faces]  # [F, 3, 3]
-    along, mirrored, flat = _face_tangents(corners, uv[mesh.faces])
-    hand = _hands(mesh.faces, mirrored, flat)
-    vertex = mesh.faces.reshape(-1).astype(np.int64)
-    pair, first, corner = np.unique(2 * vertex + np.repeat(hand, 3), return_index=True, return_inverse=True)
-    group = _groups(mesh, uv, pair)[corner]
-
-    normals = mesh.normals.astype(np.float64)[vertex]
-    share = _unit(
-        np.repeat(along, 3, axis=0) - np.einsum("cd,cd->c", np.repeat(along, 3, axis=0), normals)[:, None] * normals
-    )
-    total = np.zeros((int(group.max(initial=-1)) + 1, 3))
-    np.add.at(total, group, share * _angles(corners).reshape(-1, 1))
-    normal = normals[first]
-    tangent = total[group[first]]
+    hand = _hands(mesh, uv)
+    both = 2 * mesh.faces.reshape(-1).astype(np.int64) + np.repeat(hand, 3)
+    pair, corner = np.unique(both, return_inverse=True)
+    group = _groups(mesh, uv, pair)
+    corner = corner.reshape(-1, 3)
+    tangent = _sums(mesh, uv, group[corner])[group]
+    normal = mesh.normals[pair // 2].astype(np.float64)
     tangent -= np.einsum("vd,vd->v", tangent, normal)[:, None] * normal
     lost = np.linalg.norm(tangent, axis=1) < 1e-9
     tangent = np.where(lost[:, None], _across(normal), tangent)
     sign = np.where(pair % 2 == 1, -1.0, 1.0)[:, None]
-    out = mesh.with_vertices(pair // 2, corner.reshape(-1, 3).astype(np.int32))
+    out = mesh.with_vertices(pair // 2, corner.astype(np.int32))
     return replace(out, tangents=np.concatenate([_unit(tangent), sign], axis=1).astype(np.float32))
+
+
+def _sums(mesh: Mesh, uv: Floats, group: Ints) -> Floats:
+    """Sum [G, 3] of the faces' tangents over the corners [F, 3] of each group."""
+    total = np.zeros((int(group.max(initial=-1)) + 1, 3))
+    for part in _blocks(mesh):
+        corners = mesh.positions[mesh.faces[part]].astype(np.float64)  # [B, 3, 3]
+        normals = mesh.normals[mesh.faces[part]].astype(np.float64)
+        along = _face_tangents(corners, uv[mesh.faces[part]])[0][:, None]
+        share = _unit(
+            along - np.einsum("fcd,fcd->fc", np.broadcast_to(along, normals.shape), normals)[..., None] * normals
+        )
+        np.add.at(total, group[part], share * _angles(corners)[..., None])
+    return total
+
+
+def _blocks(mesh: Mesh) -> Iterator[slice]:
+    """The mesh's faces, BLOCK at a time."""
+    return (slice(at, at + BLOCK) for at in range(0, len(mesh.faces), BLOCK))
 
 
 def _face_tangents(corners: Floats, uv: Floats) -> tuple[Floats, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
@@ -72,20 +86,31 @@ def _face_tangents(corners: Floats, uv: Floats) -> tuple[Floats, npt.NDArray[np.
     return np.where(flat[:, None], 0.0, _unit(along)), area > 0.0, flat
 
 
-def _hands(faces: npt.NDArray[np.integer], mirrored: npt.NDArray[np.bool_], flat: npt.NDArray[np.bool_]) -> Ints:
-    """1 for mirrored faces [F], else 0; a face whose coordinates have no area is as its first corner's others are."""
-    known = np.zeros(int(faces.max(initial=-1)) + 1, bool)
-    known[faces[mirrored & ~flat].reshape(-1)] = True
-    known[faces[~mirrored & ~flat].reshape(-1)] = False
-    return np.where(flat, known[faces[:, 0]], mirrored).astype(np.int64)
+def _hands(mesh: Mesh, uv: Floats) -> Ints:
+    """1 for mirrored faces [F], else 0; a face whose coordinates have no area is as others at its first corner."""
+    mirrored, flat = (np.zeros(len(mesh.faces), bool) for _ in range(2))
+    for part in _blocks(mesh):
+        corners = mesh.positions[mesh.faces[part]].astype(np.float64)
+        _, mirrored[part], flat[part] = _face_tangents(corners, uv[mesh.faces[part]])
+    known = np.zeros(len(mesh.positions), bool)
+    known[mesh.faces[mirrored & ~flat].reshape(-1)] = True
+    known[mesh.faces[~mirrored & ~flat].reshape(-1)] = False
+    return np.where(flat, known[mesh.faces[:, 0]], mirrored).astype(np.int64)
 
 
 def _groups(mesh: Mesh, uv: Floats, pair: Ints) -> Ints:
-    """Number of the tangent that each pair of vertex and hand shares with those at its place."""
+    """Number of the tangent that each pair of vertex and hand shares with those at its place.
+
+    Pairs are told apart by a hash of 64 bits of their place, normal, coordinates and hand (SplitMix's constant).
+    """
     vertex = pair // 2
-    rows = np.concatenate([mesh.positions[vertex], mesh.normals[vertex], uv[vertex].astype(np.float32)], axis=1)
-    keys = np.ascontiguousarray(rows.astype(np.float32) + np.float32(0.0)).view(np.int32)
-    return np.unique(np.column_stack([keys, pair % 2]), axis=0, return_inverse=True)[1].reshape(-1)
+    key = (pair % 2).astype(np.uint64)
+    for values in (mesh.positions, mesh.normals, uv):
+        for column in values.T:
+            bits = (column[vertex].astype(np.float32) + np.float32(0.0)).view(np.uint32)
+            key = (key ^ bits) * np.uint64(0x9E3779B97F4A7C15)
+            key ^= key >> np.uint64(29)
+    return np.unique(key, return_inverse=True)[1].reshape(-1)
 
 
 def _angles(corners: Floats) -> Floats:
