@@ -14,6 +14,7 @@ from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.mitsuba_scene import to_mitsuba
 from kiln_workers.render.tile import TexelBatch, TileRenderer
 from kiln_workers.scene import geometry, normal_maps
+from kiln_workers.scene.load import load_scene
 from kiln_workers.scene.model import Image, LightKind, Material, Mesh, PunctualLight, Scene, TextureRef
 from kiln_workers.scene.tangents import with_tangents
 from kiln_workers.scene.texels import rasterise_texels
@@ -269,3 +270,16 @@ def test_samples_under_a_map_are_those_of_its_values(double_sided, height):
     assert drawn.any() and (np.array(sample.wo)[2][drawn] * height > 0.0).all()
     again = np.array(si.bsdf().eval_pdf(mi.BSDFContext(), si, sample.wo)[1])
     np.testing.assert_allclose(again[drawn], np.array(sample.pdf)[drawn], rtol=1e-3)
+
+
+@pytest.mark.parametrize("options", ["", "-o 0.25 0.5 0 "])
+def test_a_map_of_mtl_stands_upright(tmp_path, write_png, options):
+    """Coordinates grow upwards in OBJ; `norm` is green upwards as glTF's."""
+    write_png(tmp_path / "bumps.png", np.round(255.0 * constant()).astype(np.uint8))
+    (tmp_path / "a.mtl").write_text(f"newmtl m\nKd 0.5 0.5 0.5\nnorm {options}bumps.png\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl m\nf 1/1 2/2 3/3 4/4\n")
+    scene = load_scene(tmp_path, "a.obj")
+    mesh = replace(scene.meshes[0], lightmap_uv=scene.meshes[0].positions[:, :2] * 0.9 + 0.05)
+    found = rasterise_texels(replace(scene, meshes=(mesh,)), 8, "cpu").shading_normal[4, 4]
+    np.testing.assert_allclose(found, TILT, atol=0.01)
