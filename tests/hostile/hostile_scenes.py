@@ -574,6 +574,11 @@ def xml(name: str, word: str, body: str | Callable[[Path], str], head: str = "",
     return Bad(f"Mitsuba: {name}", word, build)
 
 
+def lit(radiance: str) -> str:
+    """A sky of this radiance."""
+    return f'<emitter type="constant">{radiance}</emitter>'
+
+
 def file_of(kind: str, name: str) -> str:
     tag = "emitter" if kind == "envmap" else "shape"
     return f'<{tag} type="{kind}"><string name="filename" value="{name}"/></{tag}>'
@@ -628,8 +633,47 @@ def _xmls() -> Iterator[Bad]:
     )
     yield xml("variables of variables", "with its variables", growing)
     yield xml("300 variables", "variables", "".join(f'<default name="v{i}" value="1"/>' for i in range(300)))
-    yield xml("<path>", "<path>", '<path value="/etc"/>')
-    yield xml("<alias>", "<alias>", '<alias id="a" as="b"/>')
+    for name in ("/etc", "..", "../outside"):
+        yield xml(f"<path> {name}", "leads out of", f'<path value="{name}"/>' + file_of("ply", "passwd"))
+        yield xml(
+            f"an include by <path> {name}", "leads out of", f'<path value="{name}"/><include filename="secret.xml"/>'
+        )
+    yield xml("<alias>", "not found", '<alias id="a" as="b"/>')
+    yield xml("a spectrum outside", "leaves the bundle", lit('<spectrum name="radiance" filename="/etc/passwd"/>'))
+    yield xml("a spectrum that is none", "is not read", lit('<spectrum name="radiance" filename="scene.xml"/>'))
+    spectrum = '<spectrum name="radiance" type="{}"><string name="filename" value="../secret.bin"/></spectrum>'
+    for kind in ("regular", "irregular"):
+        yield xml(f"a {kind} spectrum outside", "leaves the bundle", lit(spectrum.format(kind)))
+    yield xml("a black body of 1e300", "is not read", lit('<blackbody name="radiance" temperature="1e300"/>'))
+    yield xml("a spectrum of one pair", "", lit('<spectrum name="radiance" value="400:1"/>'))
+    yield xml("a spectrum of NaN", "", lit('<spectrum name="radiance" value="400:nan, 500:1"/>'))
+    yield xml("a spectrum out of order", "", lit('<spectrum name="radiance" value="500:1, 400:1"/>'))
+    for name in ("../../../etc/passwd", "a/b", ".", "Au\\..", "x" * 500):
+        metal = f'<bsdf type="conductor"><string name="material" value="{name}"/></bsdf>'
+        yield xml(f"the metal {name[:20]}", "", f'<shape type="cube">{metal}</shape>')
+        glass = f'<bsdf type="dielectric"><string name="int_ior" value="{name}"/></bsdf>'
+        yield xml(f"the glass {name[:20]}", "", f'<shape type="cube">{glass}</shape>')
+    announced = struct.pack("<HH", 0x041C, 4) + zlib.compress(struct.pack("<IxQQ", 0x1000, 50_000_000, 15_000_000))
+    yield xml("serialized, 50 million announced", "cut off", file_of("serialized", "a.bin"), **{"a.bin": announced})
+    many = struct.pack("<HH", 0x041C, 4) + zlib.compress(struct.pack("<IxQQ", 0x1000, 1 << 62, 1 << 62))
+    yield xml("serialized, 2^62 announced", "vertices", file_of("serialized", "a.bin"), **{"a.bin": many})
+    endless = struct.pack("<HH", 0x041C, 4) + zlib.compress(b"\1" * 50_000_000)
+    yield xml("serialized, a name without an end", "name", file_of("serialized", "a.bin"), **{"a.bin": endless})
+    for name, data in (("empty", b""), ("a header", announced[:4]), ("noise", announced[:4] + b"\xff" * 99)):
+        yield xml(f"serialized, {name}", "a.bin", file_of("serialized", "a.bin"), **{"a.bin": data})
+    doubled = '<bsdf id="b0" type="diffuse"/>' + "".join(
+        f'<bsdf id="b{i}" type="blendbsdf"><ref id="b{i - 1}"/><ref id="b{i - 1}"/></bsdf>' for i in range(1, 14)
+    )
+    fails = '<shape type="cube"><ref id="b13"/><emitter type="point"/></shape>'
+    yield xml("references that double 13 times", "area emitter", doubled + fails)
+    group = "".join(
+        f'<shape type="shapegroup" id="g{i}">'
+        + f'<shape type="instance"><ref id="g{i - 1}"/></shape>' * 40
+        + "</shape>"
+        for i in range(1, 4)
+    )
+    crowd = '<shape type="shapegroup" id="g0"><shape type="cube"/></shape>' + group
+    yield xml("instances of instances", "instances", crowd + '<shape type="instance"><ref id="g3"/></shape>')
     for kind in (
         "serialized",
         "shapegroup",
@@ -657,8 +701,8 @@ def _xmls() -> Iterator[Bad]:
     chain = '<bsdf id="b0" type="diffuse"/>' + "".join(
         f'<bsdf id="b{i}" type="twosided"><ref id="b{i - 1}"/></bsdf>' for i in range(1, 5001)
     )
-    yield xml("a chain of 5000 BSDFs", "twosided", chain + '<shape type="cube"><ref id="b5000"/></shape>')
-    yield xml("a reference to itself", "names nothing", '<bsdf id="a" type="twosided"><ref id="a"/></bsdf>')
+    yield xml("a chain of 5000 BSDFs", "nests too deeply", chain + '<shape type="cube"><ref id="b5000"/></shape>')
+    yield xml("a reference to itself", "within itself", '<bsdf id="a" type="twosided"><ref id="a"/></bsdf>')
     yield xml("a reference to nothing", "names nothing", '<shape type="cube"><ref id="gone"/></shape>')
     nested = "<bsdf type='twosided'>" * 5000 + "</bsdf>" * 5000
     yield xml("5000 elements deep", "nests too deeply", f'<shape type="cube">{nested}</shape>')

@@ -170,7 +170,7 @@ def test_mitsuba_materials(tmp_path):
     assert gold.double_sided and gold.metallic == 1.0 and gold.base_color[0] > gold.base_color[2]
     np.testing.assert_allclose(lamp.base_color, [1.0, 0.2158605, 0.0, 1.0], atol=1e-6)
     assert lamp.emission == (7.0, 8.0, 9.0) and not lamp.double_sided
-    assert principled.roughness == 0.7
+    np.testing.assert_allclose(principled.roughness, 0.7)
     np.testing.assert_allclose(metal.base_color[:3], 0.5)  # k^2 / (4 + k^2)
     np.testing.assert_allclose(plastic.roughness, 0.5)
     assert any("Beckmann" in note for note in scene.notes)
@@ -223,19 +223,29 @@ def test_names_that_leave_the_bundle_are_refused(tmp_path, name, form):
     ("body", "says"),
     [
         ('<shape type="serialized"/>', "shape 'serialized'"),
-        ('<shape type="cube"><bsdf type="roughdielectric"/></shape>', "bsdf 'roughdielectric'"),
+        ('<shape type="cube"><bsdf type="hair"/></shape>', "bsdf 'hair'"),
         (
             '<shape type="cube"><bsdf type="diffuse"><texture type="bitmap" name="reflectance"/></bsdf></shape>',
-            "a texture",
+            "texture 'bitmap': it has no filename",
         ),
+        ('<shape type="cube"><bsdf type="twosided" id="a"><ref id="a"/></bsdf></shape>', "within itself"),
+        ('<shape type="cube"><bsdf type="conductor"><string name="material" value="../x"/></bsdf></shape>', "'../x'"),
+        ('<shape type="cube"><bsdf type="conductor"><string name="material" value="Xx"/></bsdf></shape>', "no 'Xx'"),
+        ('<shape type="cube"><bsdf type="plastic"><float name="int_ior" value="nan"/></bsdf></shape>', "not finite"),
+        ('<alias id="none" as="b"/>', "not found"),
         ('<shape type="cube"><ref id="none"/></shape>', "names nothing"),
         ('<shape type="cube"><float name="x" value="$undefined"/></shape>', "without a default"),
         ('<emitter type="sunsky"/>', "emitter 'sunsky'"),
-        ('<medium type="homogeneous"/>', "medium 'homogeneous'"),
-        ("<path value='/etc'/>", "<path>"),
+        (
+            "<path value='/etc'/><shape type='ply'><string name='filename' value='a'/></shape>",
+            "<path> '/etc' leads out",
+        ),
         ('<shape type="ply"><string name="filename" value="gone.ply"/></shape>', "'gone.ply' is missing"),
         ('<shape type="sphere"><float name="radius" value="nan"/></shape>', "not finite"),
-        ('<shape type="cube"><transform name="to_world"><matrix value="1 2"/></transform></shape>', "2 numbers"),
+        (
+            '<shape type="cube"><transform name="to_world"><matrix value="1 2"/></transform></shape>',
+            "matrix must have 9 or 16 values",
+        ),
         ('<include filename="scene.xml"/>', "included files"),
         ("<shape", "not well-formed"),
         ('<sensor type="perspective"/>', "has no faces"),

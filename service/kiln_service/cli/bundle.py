@@ -8,6 +8,7 @@ as `environment/<name>`, and its folder bounds its links.
 """
 
 import codecs
+import contextlib
 import hashlib
 import io
 import json
@@ -33,6 +34,8 @@ from kiln_schemas.text import told
 
 MAX_INCLUDES: Final = 64
 """XML files that one scene includes, as many as the worker reads."""
+MITSUBA_UNUSED: Final = frozenset({"sensor", "integrator", "film", "sampler", "rfilter", "medium", "phase", "volume"})
+"""Elements of Mitsuba's XML whose files a bake does without."""
 GLB_MAGIC: Final = b"glTF"
 GLB_JSON: Final = b"JSON"
 MTL_OPTION_VALUES: Final[Mapping[str, int]] = {
@@ -260,34 +263,81 @@ class _Elements(ElementTree.TreeBuilder):
 
 
 def _mitsuba_xml(folder: Path, name: str) -> References:
-    yield from _xml_references(folder, name, {}, [name])
+    yield from _MitsubaFiles(folder, name).references(name)
 
 
-def _xml_references(folder: Path, name: str, defaults: dict[str, str], read: list[str]) -> References:
-    """The files that an XML file names, and those of the files that it includes; `read` holds what was included."""
-    try:
-        root = ElementTree.fromstring(_read(folder, name), ElementTree.XMLParser(target=_Elements(name)))
-    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two of encodings
-        raise InputError(f"is not XML: {told(str(error), 80)}", where=name, remedy="Export the scene again.") from None
-    for node in root.iter("default"):
-        defaults.setdefault(node.get("name", ""), node.get("value", ""))
+class _MitsubaFiles:
+    """What a Mitsuba scene names, in the order of its elements, as the worker looks for it (`scene.mitsuba_files`)."""
 
-    def path_of(value: str) -> str:
-        return _joined(name, re.sub(r"\$(\w+)", lambda m: defaults.get(m[1], m[0]), value))
+    def __init__(self, folder: Path, entry: str) -> None:
+        self.folder = folder
+        self.entry = entry
+        self.defaults: dict[str, str] = {}
+        self.paths: list[str] = []
+        self.included = [entry]
 
-    for node in root.iter("string"):
-        value = node.get("value")
-        if node.get("name") == "filename" and value:
-            yield path_of(value), name
-    for node in root.iter("include"):
-        path = path_of(node.get("filename", ""))
+    def references(self, name: str) -> References:
+        """The files that an XML file names, and those of the files that it includes."""
+        text = _read(self.folder, name)
+        try:
+            root = ElementTree.fromstring(text, ElementTree.XMLParser(target=_Elements(name)))
+        except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two of encodings
+            detail = f"is not XML: {told(str(error), 80)}"
+            raise InputError(detail, where=name, remedy="Export the scene again.") from None
+        yield from self._element(root, name)
+
+    def _element(self, node: ElementTree.Element, name: str, used: bool = True) -> References:
+        if node.tag == "default":
+            self.defaults.setdefault(node.get("name", ""), self._filled(node.get("value", "")))
+        elif node.tag == "path":
+            self.paths = [*self._folders(self._filled(node.get("value", "")), name), *self.paths]
+        elif node.tag == "include":
+            yield from self._include(self._found(self._filled(node.get("filename", "")), name), name)
+        elif node.tag == "spectrum" and node.get("filename"):
+            yield self._found(self._filled(node.get("filename", "")), name), name
+        elif node.tag == "string" and node.get("name") == "filename" and node.get("value"):
+            path = self._found(self._filled(node.get("value", "")), name)
+            if used or is_inside(self.folder, path):
+                yield path, name
+        for child in node:
+            yield from self._element(child, name, used and child.tag not in MITSUBA_UNUSED)
+
+    def _include(self, path: str, name: str) -> References:
         yield path, name
-        if path not in read:
-            if len(read) > MAX_INCLUDES:
-                raise InputError(f"includes more than {MAX_INCLUDES} files", where=name, remedy="Include fewer.")
-            read.append(path)
-            _open(folder, path, name).close()
-            yield from _xml_references(folder, path, defaults, read)
+        if path in self.included:
+            return
+        if len(self.included) > MAX_INCLUDES:
+            raise InputError(f"includes more than {MAX_INCLUDES} files", where=name, remedy="Include fewer.")
+        self.included.append(path)
+        _open(self.folder, path, name).close()
+        yield from self.references(path)
+
+    def _filled(self, value: str) -> str:
+        return re.sub(r"\$(\w+)", lambda match: self.defaults.get(match[1], match[0]), value)
+
+    def _found(self, reference: str, name: str) -> str:
+        """The bundle path of a name: the first that is there, else the first that stays in the folder."""
+        paths, refusals = [], []
+        for base in (*self.paths, posixpath.dirname(self.entry), posixpath.dirname(name)):
+            try:
+                paths.append(_joined(posixpath.join(base, "."), reference))
+            except InputError as error:
+                refusals.append(InputError(error.detail, where=name, remedy=error.remedy))
+                continue
+            if is_inside(self.folder, paths[-1]):
+                return paths[-1]
+        if not paths:
+            raise refusals[0]
+        return paths[0]
+
+    def _folders(self, reference: str, name: str) -> list[str]:
+        """The folders that a `<path>` may mean; one that leads out of the scene's folder is ignored."""
+        folders = []
+        for file in dict.fromkeys((name, self.entry)):
+            joined = posixpath.normpath(posixpath.join(posixpath.dirname(file), reference))
+            with contextlib.suppress(InputError):
+                folders.append("" if joined == "." else _joined(file, reference))
+        return folders
 
 
 READERS: Final[Mapping[str, Callable[[Path, str], References]]] = {

@@ -1,186 +1,144 @@
-"""Reader of Mitsuba 3 scenes in XML, as far as they fit the glTF model; every other plugin is refused by name.
+"""Reader of Mitsuba scenes in XML, of versions 0.5 to 3: the counterpart of every plugin in the glTF model.
 
-Shapes obj, ply, rectangle, cube, sphere and disk; BSDFs diffuse, conductor, roughconductor, plastic, roughplastic,
-principled and twosided; emitters area, envmap, constant, point, spot and directional. Cameras, films and integrators
-play no part. The XML is parsed without document types (`xml_nodes`) and all files lie in the bundle.
+`mitsuba_files` checks the files and makes one document of them, Mitsuba's own parser reads it (`mitsuba_tree`), and
+`mitsuba_shapes`, `mitsuba_textures`, `mitsuba_surfaces` and `mitsuba_emitters` convert. What is approximated or ignored
+is named in a note, a plugin without a counterpart is refused by name. docs/scene-input.md lists all of them.
 """
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from kiln_schemas.errors import InputError
-from kiln_schemas.text import quoted
-from kiln_workers.scene.bundle import BundleFolder
-from kiln_workers.scene.environment import MITSUBA_TURN, read_environment
-from kiln_workers.scene.geometry import check_mesh_count, check_triangle_count, place, unique_names
-from kiln_workers.scene.limits import MAX_TEXT_BYTES, check_count
-from kiln_workers.scene.mitsuba_plugins import shape_meshes, surface_material
-from kiln_workers.scene.mitsuba_values import OBJECT_TAGS, VALUE_TAGS, Plugin, substituted
-from kiln_workers.scene.model import Environment, LightKind, Material, Mesh, PunctualLight, Scene
-from kiln_workers.scene.xml_nodes import Node, parse_xml
+from kiln_workers.scene.geometry import Floats, RawMesh, check_mesh_count, check_triangle_count, place, unique_names
+from kiln_workers.scene.mitsuba_emitters import ENVIRONMENTS, LAMPS, environment, lamp
+from kiln_workers.scene.mitsuba_files import read_document
+from kiln_workers.scene.mitsuba_shapes import flipped, shape_meshes
+from kiln_workers.scene.mitsuba_surfaces import Surface, Surfaces
+from kiln_workers.scene.mitsuba_textures import Textures, Value, number
+from kiln_workers.scene.mitsuba_tree import Plugin, parse_document
+from kiln_workers.scene.model import Environment, Material, Mesh, PunctualLight, Scene
 
-IGNORED_TAGS: Final = frozenset({"sensor", "integrator", "film", "sampler", "rfilter"})
-MAX_INCLUDES: Final = 64
-"""Files that are included, over all; so a file may not include itself for ever."""
-MAX_VARIABLES: Final = 256
+DEFAULT: Final = Surface("default", number(0.5), specular=0.0)
+"""What Mitsuba gives a shape without a BSDF."""
 
 
 def read_mitsuba_xml(folder: Path, entry: str) -> Scene:
-    """The scene of a Mitsuba 3 XML file of the bundle `folder`."""
-    reader = _Reader(BundleFolder(folder, entry))
-    return reader.read()
+    """The scene of a Mitsuba XML file of the bundle `folder`."""
+    document = read_document(folder, entry)
+    return _Reader(folder, document.notes).read(parse_document(document))
 
 
-@dataclass
 class _Reader:
-    bundle: BundleFolder
-    variables: dict[str, str] = field(default_factory=dict)
-    known: dict[str, Plugin] = field(default_factory=dict)
-    materials: dict[Material, int] = field(default_factory=dict)
-    meshes: list[Mesh] = field(default_factory=list)
-    lights: list[PunctualLight] = field(default_factory=list)
-    environment: Environment | None = None
-    notes: list[str] = field(default_factory=list)
-    triangles: int = 0
-    includes: int = 0
+    def __init__(self, folder: Path, notes: list[str]) -> None:
+        self.folder = folder
+        self.notes = notes
+        self.textures = Textures(folder, notes)
+        self.surfaces = Surfaces(self.textures)
+        self.materials: dict[Material, int] = {}
+        self.meshes: list[Mesh] = []
+        self.lights: list[PunctualLight] = []
+        self.environment: Environment | None = None
+        self.triangles = 0
+        self.parts: dict[Plugin, list[RawMesh]] = {}  # of shapes in groups
 
-    def read(self) -> Scene:
-        for plugin in self._top_level(self.bundle):
-            if plugin.tag == "shape":
-                self._shape(plugin)
+    def read(self, plugins: list[Plugin]) -> Scene:
+        """The scene of the plugins at its top."""
+        for plugin in plugins:
+            if plugin.tag == "shape" and plugin.kind == "shapegroup":
+                _parts(plugin)
+            elif plugin.tag == "shape":
+                self._shape(plugin, np.eye(4))
             elif plugin.tag == "emitter":
                 self._emitter(plugin)
-            elif plugin.tag != "bsdf":
-                raise plugin.fail("this kind of object is not read")
         names = unique_names(mesh.name for mesh in self.meshes)
         meshes = tuple(replace(mesh, name=name) for mesh, name in zip(self.meshes, names, strict=True))
+        notes = tuple(dict.fromkeys(self.notes))
         return Scene(
-            meshes, tuple(self.materials), (), tuple(self.lights), self.environment, tuple(dict.fromkeys(self.notes))
+            meshes, tuple(self.materials), tuple(self.textures.images), tuple(self.lights), self.environment, notes
         )
 
-    def _top_level(self, bundle: BundleFolder) -> list[Plugin]:
-        where = bundle.origin
-        root = parse_xml(bundle.read(Path(where).name, "scene", MAX_TEXT_BYTES), where)
-        if root.tag != "scene":
-            raise InputError(f"begins with {quoted(f'<{root.tag}>')}, not with <scene>", where=where)
-        plugins: list[Plugin] = []
-        for node in root.children:
-            attributes = substituted(node, self.variables, where)
-            if node.tag == "default":
-                self.variables.setdefault(attributes.get("name", ""), attributes.get("value", ""))
-                check_count(len(self.variables), MAX_VARIABLES, "variables", where)
-            elif node.tag == "include":
-                self.includes += 1
-                check_count(self.includes, MAX_INCLUDES, "included files", where)
-                inner = BundleFolder(bundle.folder, bundle.name(attributes.get("filename", "")))
-                if not bundle.holds(attributes.get("filename", "")):
-                    raise InputError(f"the included file '{inner.origin}' is missing", where=where, remedy="Add it.")
-                plugins += self._top_level(inner)
-            elif node.tag in OBJECT_TAGS:
-                plugins.append(self._plugin(node, bundle))
-            elif node.tag not in IGNORED_TAGS and node.tag not in VALUE_TAGS:
-                raise InputError(
-                    f"line {node.line}: {quoted(f'<{node.tag}>')} is not read", where=where, remedy="Remove it."
-                )
-        return plugins
+    def _shape(self, plugin: Plugin, outer: Floats, grouped: bool = False) -> None:
+        with np.errstate(over="ignore", invalid="ignore"):  # `place` refuses what is not finite
+            transform = outer @ plugin.transform()
+        if plugin.kind == "instance":
+            if grouped:
+                raise plugin.fail("there are no instances within a shapegroup", "Put its shapes there.")
+            groups = [child for child in plugin.all("shape") if child.kind == "shapegroup"]
+            if len(groups) != 1:
+                raise plugin.fail(f"it holds {len(groups)} shape groups", "Put one reference to a shapegroup in it.")
+            for child in _parts(groups[0]):
+                self._shape(child, transform, grouped=True)
+        elif plugin.kind == "merge":
+            for child in _parts(plugin):
+                self._shape(child, transform, grouped)
+        else:
+            self._placed(plugin, transform, grouped)
 
-    def _plugin(self, node: Node, bundle: BundleFolder) -> Plugin:
-        where = bundle.origin
-        attributes = substituted(node, self.variables, where)
-        plugin = Plugin(node.tag, attributes.get("type", ""), node.line, where, attributes.get("name", ""))
-        for child in node.children:
-            inner = substituted(child, self.variables, where)
-            if child.tag in OBJECT_TAGS:
-                plugin.children.append(self._plugin(child, bundle))
-            elif child.tag == "ref":
-                target = self.known.get(inner.get("id", ""))
-                if target is None:
-                    raise plugin.fail(f"the reference {quoted(inner.get('id', ''))} names nothing before it")
-                plugin.children.append(target)
-            elif child.tag in VALUE_TAGS:
-                steps = [Node(s.tag, substituted(s, self.variables, where), s.line) for s in child.children]
-                plugin.values[inner.get("name", "")] = Node(child.tag, inner, child.line, steps)
-            else:
-                raise plugin.fail(f"{quoted(f'<{child.tag}>')} is not read")
-        if "filename" in plugin.values:
-            # Hold the name to the bundle now, relative to the file that names it.
-            plugin.values["filename"].attributes["value"] = bundle.name(plugin.text("filename"))
-        if "id" in attributes:
-            self.known[attributes["id"]] = plugin
-        return plugin
-
-    def _shape(self, plugin: Plugin) -> None:
-        material = Material("default", base_color=(0.5, 0.5, 0.5, 1.0))
-        for child in plugin.children:
-            if child.tag == "bsdf":
-                material, notes = surface_material(child)
-                self.notes += notes
-            elif child.tag == "emitter" and child.kind != "area":
-                raise child.fail("only an area emitter belongs to a shape")
-            elif child.tag not in ("bsdf", "emitter"):
-                raise child.fail("this is not read inside a shape")
-        for child in plugin.children:
-            if child.tag == "emitter":
-                material = replace(material, emission=child.colour("radiance", (1.0, 1.0, 1.0)))
-        number = self.materials.setdefault(material, len(self.materials))
-        for raw in shape_meshes(plugin, self.bundle.folder, number):
+    def _placed(self, plugin: Plugin, transform: Floats, grouped: bool) -> None:
+        meshes = self.parts.get(plugin) or shape_meshes(plugin, self.folder)
+        if grouped:
+            self.parts[plugin] = meshes
+        for raw, material, painted in self._dressed(plugin, meshes):
             self.triangles += len(raw.faces)
             check_triangle_count(self.triangles, plugin.where)
             check_mesh_count(len(self.meshes) + 1, plugin.where)
-            mesh, notes = place(raw, plugin.transform())
+            named = replace(
+                raw,
+                name=plugin.properties.id() or raw.name,
+                material=self.materials.setdefault(material, len(self.materials)),
+                colors=raw.colors if painted else None,
+            )
+            mesh, notes = place(named, transform)
             self.notes += notes
             self.meshes += [mesh] if mesh is not None else []
 
+    def _dressed(self, plugin: Plugin, meshes: list[RawMesh]) -> Iterator[tuple[RawMesh, Material, bool]]:
+        """The meshes of a shape with their materials, and whether their vertices' colours play a part."""
+        surface = self._surface(plugin)
+        emission = self._emission(plugin)
+        if surface is None:
+            self.notes.append(f"{plugin.label}: left out, its BSDF 'null' is no surface.")
+            return
+        for mesh in meshes:
+            painted = surface.base.painted
+            if emission is None or not surface.double_sided:
+                yield mesh, self.surfaces.material(surface, emission), painted
+                continue
+            # A lamp shines from its front alone, whatever its BSDF does: two sheets.
+            yield mesh, replace(self.surfaces.material(surface, emission), double_sided=False), painted
+            yield flipped(mesh), replace(self.surfaces.material(surface), double_sided=False), painted
+
+    def _surface(self, plugin: Plugin) -> Surface | None:
+        bsdfs = plugin.all("bsdf")
+        if len(bsdfs) > 1:
+            raise plugin.fail(f"it has {len(bsdfs)} BSDFs", "Give it one.")
+        return self.surfaces.surface(bsdfs[0]) if bsdfs else DEFAULT
+
+    def _emission(self, plugin: Plugin) -> Value | None:
+        emitters = plugin.all("emitter")
+        if not emitters:
+            return None
+        if len(emitters) > 1 or emitters[0].kind != "area":
+            raise emitters[0].fail("only one area emitter belongs to a shape")
+        return self.textures.emitted(emitters[0])
+
     def _emitter(self, plugin: Plugin) -> None:
-        if plugin.kind in ("envmap", "constant"):
+        if plugin.kind in ENVIRONMENTS:
             if self.environment is not None:
                 raise plugin.fail("a scene has one environment", "Remove the others.")
-            self.environment = self._environment(plugin)
-        elif plugin.kind in ("point", "spot", "directional"):
-            self.lights.append(_light(plugin))
-        else:
-            raise plugin.fail("this emitter is not read")
-
-    def _environment(self, plugin: Plugin) -> Environment:
-        if plugin.kind == "constant":
-            radiance = np.array(plugin.colour("radiance", (1.0, 1.0, 1.0)), dtype=np.float32)
-            return Environment(np.broadcast_to(radiance, (16, 32, 3)).copy())
-        name = plugin.text("filename")
-        pixels, notes = read_environment(BundleFolder(self.bundle.folder, plugin.kind).read(name, "environment"), name)
-        self.notes += notes
-        turn = plugin.transform()[:3, :3]
-        about_y = np.array([[turn[0, 0], 0, turn[0, 2]], [0, 1, 0], [-turn[0, 2], 0, turn[0, 0]]])
-        if not np.allclose(turn, about_y, atol=1e-5) or not np.isclose(
-            np.hypot(turn[0, 0], turn[0, 2]), 1.0, atol=1e-5
-        ):
-            raise plugin.fail("its to_world is no rotation about +Y", "Turn the image itself.")
-        rotation = float(np.rad2deg(np.arctan2(turn[0, 2], turn[0, 0])))
-        return Environment(pixels, plugin.number("scale", 1.0), rotation + MITSUBA_TURN)
+            self.environment = environment(plugin, self.folder, self.notes)
+        elif plugin.kind in LAMPS:
+            self.lights.append(lamp(plugin, self.notes))
+        elif plugin.kind != "area":  # which stands here for shapes that refer to it
+            raise plugin.fail("this emitter is not read", f"Use area, {', '.join((*ENVIRONMENTS, *LAMPS))}.")
 
 
-def _light(plugin: Plugin) -> PunctualLight:
-    matrix = plugin.transform()
-    forward = matrix[:3, :3] @ np.array([0.0, 0.0, 1.0])
-    position = matrix[:3, 3]
-    if plugin.kind == "point" and "position" in plugin.values:
-        position = plugin.vector("position", (0.0, 0.0, 0.0))
-    if plugin.kind == "directional" and "direction" in plugin.values:
-        forward = plugin.vector("direction", (0.0, 0.0, 1.0))
-    length = float(np.linalg.norm(forward))
-    if length == 0.0:
-        raise plugin.fail("it has no direction")
-    x, y, z = (float(value) for value in forward / length)
-    px, py, pz = (float(value) for value in position)
-    cutoff = plugin.number("cutoff_angle", 20.0)
-    return PunctualLight(
-        name=plugin.kind,
-        kind=LightKind(plugin.kind),
-        intensity=plugin.colour("irradiance" if plugin.kind == "directional" else "intensity", (1.0, 1.0, 1.0)),
-        position=(px, py, pz),
-        direction=(x, y, z),
-        inner_cone=float(np.deg2rad(plugin.number("beam_width", 0.75 * cutoff))),
-        outer_cone=float(np.deg2rad(cutoff)),
-    )
+def _parts(plugin: Plugin) -> list[Plugin]:
+    """The shapes in a shape, at least one."""
+    parts = plugin.all("shape")
+    if not parts:
+        raise plugin.fail("it holds no shapes")
+    return parts
