@@ -108,7 +108,7 @@ def test_other_bsdfs_have_a_counterpart(tmp_path):
         np.testing.assert_allclose(material.base_color[:3], [0.8, 0.2, 0.0], err_msg=kind)
         assert kind in said and material.clearcoat == (kind == "coating")
     bumps, said = material_of(tmp_path, f'<bsdf type="normalmap">{paint.format("normalmap")}{red}</bsdf>')
-    assert bumps.normal_texture is not None and "viewers" in said
+    assert bumps.normal_texture is not None
     thin, _ = material_of(tmp_path, '<bsdf type="principledthin"/>')
     assert thin.double_sided
     plastic, _ = material_of(tmp_path, '<bsdf type="pplastic"/>')

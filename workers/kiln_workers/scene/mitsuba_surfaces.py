@@ -388,7 +388,6 @@ def _normalmap(surfaces: Surfaces, plugin: Plugin) -> Surface | None:
     texture = plugin.child("normalmap")
     if inner is None or texture is None:
         return inner
-    surfaces.notes.append(f"{plugin.label}: for viewers alone, the bake uses the vertices' normals.")
     return replace(inner, normal=surfaces.textures.texture(texture))
 
 

@@ -20,6 +20,7 @@ from kiln_workers.scene.mitsuba_surfaces import Surface, Surfaces
 from kiln_workers.scene.mitsuba_textures import Textures, Value, number
 from kiln_workers.scene.mitsuba_tree import Plugin, parse_document
 from kiln_workers.scene.model import Environment, Material, Mesh, PunctualLight, Scene
+from kiln_workers.scene.tangents import with_tangents
 
 DEFAULT: Final = Surface("default", number(0.5), specular=0.0)
 """What Mitsuba gives a shape without a BSDF."""
@@ -56,9 +57,8 @@ class _Reader:
         names = unique_names(mesh.name for mesh in self.meshes)
         meshes = tuple(replace(mesh, name=name) for mesh, name in zip(self.meshes, names, strict=True))
         notes = tuple(dict.fromkeys(self.notes))
-        return Scene(
-            meshes, tuple(self.materials), tuple(self.textures.images), tuple(self.lights), self.environment, notes
-        )
+        materials, images = tuple(self.materials), tuple(self.textures.images)
+        return _with_mitsuba_tangents(Scene(meshes, materials, images, tuple(self.lights), self.environment, notes))
 
     def _shape(self, plugin: Plugin, outer: Floats, grouped: bool = False) -> None:
         with np.errstate(over="ignore", invalid="ignore"):  # `place` refuses what is not finite
@@ -142,3 +142,17 @@ def _parts(plugin: Plugin) -> list[Plugin]:
     if not parts:
         raise plugin.fail("it holds no shapes")
     return parts
+
+
+def _with_mitsuba_tangents(scene: Scene) -> Scene:
+    """The scene whose normal maps have green along n x dp/du, however v grows, as Mitsuba's `normalmap` has it."""
+    scene = with_tangents(scene)
+
+    def right_handed(mesh: Mesh) -> Mesh:
+        if mesh.tangents is None:
+            return mesh
+        return replace(
+            mesh, tangents=np.concatenate([mesh.tangents[:, :3], np.ones_like(mesh.tangents[:, 3:])], axis=1)
+        )
+
+    return replace(scene, meshes=tuple(map(right_handed, scene.meshes)))
