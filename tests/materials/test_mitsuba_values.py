@@ -147,3 +147,17 @@ def test_what_a_bake_has_no_use_for_is_left_out(tmp_path):
     notes = " ".join(scene.notes)
     assert "Integrator 'path' ignored" in notes and "Medium 'homogeneous' ignored" in notes and "Subsurface" in notes
     assert set(collect(tmp_path / "scene.xml").sources) == {"scene.xml"}
+
+
+def test_a_cloud_of_spheres_has_fewer_triangles_each(tmp_path):
+    ball = '<shape type="sphere"><float name="radius" value="0.1"/><point name="center" value="{} 0 0"/></shape>'
+    few = scene_of(tmp_path, "".join(ball.format(i) for i in range(4)))
+    many = scene_of(tmp_path, "".join(ball.format(i) for i in range(1024)))
+    assert many.triangles < 20 * few.triangles and "1024 spheres" in " ".join(many.notes)
+
+
+def test_a_view_is_spelt_as_mitsuba_0_5_does(tmp_path):
+    look = '<lookAt origin="1 2 3" target="1 5 3" up="0 0 1"/>'
+    body = f'<shape type="rectangle"><transform name="toWorld">{look}</transform></shape>'
+    rectangle = scene_of(tmp_path, body, "0.5.0").meshes[0]
+    np.testing.assert_allclose(rectangle.normals, np.tile([0.0, 1.0, 0.0], (len(rectangle.normals), 1)), atol=1e-6)

@@ -96,6 +96,8 @@ class _Files:
 
     def element(self, node: Node, where: str, top: bool = False) -> None:
         """Write an element, or carry it out."""
+        if node.tag == "lookAt":  # of Mitsuba 0.5
+            node = Node("lookat", node.attributes, node.line, node.children)
         attributes = self._substituted(node, where)
         if node.tag == "default":
             self.variables.setdefault(attributes.get("name", ""), attributes.get("value", ""))

@@ -1,8 +1,8 @@
 """Mitsuba's shapes as triangles in their own space, with Mitsuba's normals and texture coordinates.
 
-Rectangles and cubes are exact; spheres, disks and cylinders are divided into `STEPS` sectors. Mitsuba's v counts from
-the first row of an image, as `model` has it. A file without normals gets smooth ones, weighted by angle (Thuermer and
-Wuethrich 1998), unless `face_normals` is set.
+Rectangles and cubes are exact; spheres, disks and cylinders are divided into `STEPS` sectors, fewer in a scene of many.
+Mitsuba's v counts from the first row of an image, as `model` has it. A file without normals gets smooth ones, weighted
+by angle (Thuermer and Wuethrich 1998), unless `face_normals` is set.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,15 +22,23 @@ from kiln_workers.scene.serialized import parse_serialized
 
 STEPS: Final = 64
 """Sectors around a sphere, disk or cylinder; a sphere has half as many rings."""
+LEAST_STEPS: Final = 12
+MANY: Final = 64
+"""Curved shapes beyond which each has fewer sectors."""
 FILES: Final = ("obj", "ply", "serialized")
 
 
-def shape_meshes(plugin: Plugin, folder: Path) -> list[RawMesh]:
+def sectors(curved: int) -> int:
+    """Sectors for each of so many curved shapes: their triangles together stay as many as `MANY` have."""
+    return STEPS if curved <= MANY else max(LEAST_STEPS, 4 * int(STEPS * (MANY / curved) ** 0.5 / 4))
+
+
+def shape_meshes(plugin: Plugin, folder: Path, steps: int = STEPS) -> list[RawMesh]:
     """The triangles of a shape in its own space; InputError for a shape that is not read."""
     if plugin.kind in FILES:
         meshes = _file_meshes(plugin, folder)
     elif plugin.kind in PRIMITIVES:
-        meshes = [PRIMITIVES[plugin.kind](plugin)]
+        meshes = [PRIMITIVES[plugin.kind](plugin, steps)]
     else:
         raise plugin.fail("this shape is not read", f"Use {', '.join((*FILES, *PRIMITIVES))}.")
     if plugin.flag("face_normals"):
@@ -85,7 +93,7 @@ def _turned(uv: Floats | None) -> Floats | None:
     return None if uv is None else uv * [1.0, -1.0] + [0.0, 1.0]
 
 
-def _rectangle(plugin: Plugin) -> RawMesh:
+def _rectangle(plugin: Plugin, steps: int) -> RawMesh:
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     return RawMesh("rectangle", corners, np.array([[0, 1, 2], [0, 2, 3]]), 0, None, 0.5 * corners[:, :2] + 0.5)
 
@@ -101,7 +109,7 @@ CUBE_SIDES: Final = (
 )
 
 
-def _cube(plugin: Plugin) -> RawMesh:
+def _cube(plugin: Plugin, steps: int) -> RawMesh:
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     sides = [
         np.array(normal) + square[:, :1] * np.array(right) + square[:, 1:] * np.array(up)
@@ -125,36 +133,36 @@ def _grid(rows: int, columns: int) -> Ints:
     return np.concatenate([np.stack([first, below, below + 1], 1), np.stack([first, below + 1, first + 1], 1)])
 
 
-def _sphere(plugin: Plugin) -> RawMesh:
-    v, u = (grid.reshape(-1) for grid in np.meshgrid(_steps(STEPS // 2), _steps(STEPS), indexing="ij"))
+def _sphere(plugin: Plugin, steps: int) -> RawMesh:
+    v, u = (grid.reshape(-1) for grid in np.meshgrid(_steps(steps // 2), _steps(steps), indexing="ij"))
     theta, phi = np.pi * v, 2.0 * np.pi * u
     normals = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
     positions = plugin.vector("center", (0.0, 0.0, 0.0)) + _radius(plugin) * normals
-    faces = _grid(STEPS // 2, STEPS)
+    faces = _grid(steps // 2, steps)
     # Half of the triangles at the poles have no area.
     upper, lower = faces[: len(faces) // 2], faces[len(faces) // 2 :]
-    faces = np.concatenate([upper[:-STEPS], lower[STEPS:]])
+    faces = np.concatenate([upper[:-steps], lower[steps:]])
     return RawMesh("sphere", positions, faces, 0, normals, np.stack([u, v], axis=1))
 
 
-def _disk(plugin: Plugin) -> RawMesh:
-    v, u = (grid.reshape(-1) for grid in np.meshgrid(_steps(STEPS), np.array([0.0, 1.0]), indexing="ij"))
+def _disk(plugin: Plugin, steps: int) -> RawMesh:
+    v, u = (grid.reshape(-1) for grid in np.meshgrid(_steps(steps), np.array([0.0, 1.0]), indexing="ij"))
     positions = np.stack([u * np.cos(2.0 * np.pi * v), u * np.sin(2.0 * np.pi * v), np.zeros_like(u)], axis=1)
-    sector = 2 * np.arange(STEPS)
+    sector = 2 * np.arange(steps)
     return RawMesh("disk", positions, np.stack([sector, sector + 1, sector + 3], 1), 0, None, np.stack([u, v], axis=1))
 
 
-def _cylinder(plugin: Plugin) -> RawMesh:
+def _cylinder(plugin: Plugin, steps: int) -> RawMesh:
     radius = _radius(plugin)
     start, end = plugin.vector("p0", (0.0, 0.0, 0.0)), plugin.vector("p1", (0.0, 0.0, 1.0))
     length = float(np.linalg.norm(end - start))
     if length == 0.0:
         raise plugin.fail("its ends p0 and p1 are one point")
-    v, u = (grid.reshape(-1) for grid in np.meshgrid(np.array([1.0, 0.0]), _steps(STEPS), indexing="ij"))
+    v, u = (grid.reshape(-1) for grid in np.meshgrid(np.array([1.0, 0.0]), _steps(steps), indexing="ij"))
     s, t = _frame((end - start) / length)
     normals = np.cos(2.0 * np.pi * u)[:, None] * s + np.sin(2.0 * np.pi * u)[:, None] * t
     positions = start + v[:, None] * (end - start) + radius * normals
-    return RawMesh("cylinder", positions, _grid(1, STEPS), 0, normals, np.stack([u, v], axis=1))
+    return RawMesh("cylinder", positions, _grid(1, steps), 0, normals, np.stack([u, v], axis=1))
 
 
 def _frame(n: Floats) -> tuple[Floats, Floats]:
@@ -170,7 +178,8 @@ def _steps(count: int) -> Floats:
     return np.linspace(0.0, 1.0, count + 1)
 
 
-PRIMITIVES: Final[Mapping[str, Callable[[Plugin], RawMesh]]] = {
+CURVED: Final = ("sphere", "disk", "cylinder")
+PRIMITIVES: Final[Mapping[str, Callable[[Plugin, int], RawMesh]]] = {
     "rectangle": _rectangle,
     "cube": _cube,
     "sphere": _sphere,

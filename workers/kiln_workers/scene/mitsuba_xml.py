@@ -15,7 +15,7 @@ import numpy as np
 from kiln_workers.scene.geometry import Floats, RawMesh, check_mesh_count, check_triangle_count, place, unique_names
 from kiln_workers.scene.mitsuba_emitters import ENVIRONMENTS, LAMPS, environment, lamp
 from kiln_workers.scene.mitsuba_files import read_document
-from kiln_workers.scene.mitsuba_shapes import flipped, shape_meshes
+from kiln_workers.scene.mitsuba_shapes import CURVED, STEPS, flipped, sectors, shape_meshes
 from kiln_workers.scene.mitsuba_surfaces import Surface, Surfaces
 from kiln_workers.scene.mitsuba_textures import Textures, Value, number
 from kiln_workers.scene.mitsuba_tree import Plugin, parse_document
@@ -43,10 +43,15 @@ class _Reader:
         self.lights: list[PunctualLight] = []
         self.environment: Environment | None = None
         self.triangles = 0
+        self.steps = STEPS
         self.parts: dict[Plugin, list[RawMesh]] = {}  # of shapes in groups
 
     def read(self, plugins: list[Plugin]) -> Scene:
         """The scene of the plugins at its top."""
+        curved = sum(child.kind in CURVED for plugin in plugins for child in (plugin, *plugin.all("shape")))
+        self.steps = sectors(curved)
+        if self.steps < STEPS:
+            self.notes.append(f"{curved} spheres, disks and cylinders: {self.steps} sectors each, not {STEPS}.")
         for plugin in plugins:
             if plugin.tag == "shape" and plugin.kind == "shapegroup":
                 _parts(plugin)
@@ -78,7 +83,7 @@ class _Reader:
             self._placed(plugin, transform, grouped)
 
     def _placed(self, plugin: Plugin, transform: Floats, grouped: bool) -> None:
-        meshes = self.parts.get(plugin) or shape_meshes(plugin, self.folder)
+        meshes = self.parts.get(plugin) or shape_meshes(plugin, self.folder, self.steps)
         if grouped:
             self.parts[plugin] = meshes
         for raw, material, painted in self._dressed(plugin, meshes):
