@@ -130,3 +130,21 @@ def test_cut_outs_let_light_through(
     assert images[0] is not None and images[1] is not None and wanted is not None
     assert np.all(images[0][0][above] == 1.0)
     np.testing.assert_array_equal(images[1], wanted)
+
+
+def test_a_pane_lets_its_share_of_the_sky_through(
+    quad: Callable[..., Mesh],
+    texels: Callable[..., TexelBatch],
+    renderer: Callable[..., TileRenderer],
+    sky: Environment,
+) -> None:
+    """A wide pane of opacity 0.25: three quarters of the environment in every direction that is not grazing."""
+    pane = Material("pane", (0.0, 0.0, 0.0, 0.25), blend=True, double_sided=True)
+    floor = quad((-1, 0, -1), (0, 0, 2), (2, 0, 0))
+    above = quad((-5e3, 0.5, -5e3), (0, 0, 1e4), (1e4, 0, 0), 1)
+    scene = with_environment(Scene((floor, above), (Material("floor"), pane)), sky)
+    points = [(0, 0, 0), (0.5, 0, 0.5)]
+    image = renderer(scene, samples=1, irradiance_samples=1).render(texels(points, alpha=0.3)).visibility
+    assert image is not None
+    steep = octahedral.pixel_directions(16)[..., 1] > 0.3
+    np.testing.assert_allclose(image[:, steep], 0.75, atol=0.01)

@@ -117,12 +117,12 @@ def trace_visibility(
 def weighted_visibility(
     table: RayTable, size: int, alpha: Float32, lanes: Int64, seen: Float32, above: Float32
 ) -> Float32:
-    """W_E [L, 3] of the lanes (texel, pixel) [L, 2]; texels numbered from 0, alpha [T]; seen, above [L]."""
+    """W_E [L, 3] of the lanes (texel, pixel) [L, 2]; texels count from 0, alpha [T]; seen [L] or [3, L], above [L]."""
     out = np.empty((len(lanes), 3), np.float32)
     grids = np.array([source_grid(float(value), size) for value in alpha])
     for grid in np.unique(grids):
         mask = grids[lanes[:, 0]] == grid
-        out[mask] = _convolved(table, size, int(grid), alpha, lanes[mask], seen[mask], above[mask])
+        out[mask] = _convolved(table, size, int(grid), alpha, lanes[mask], seen[..., mask], above[mask])
     return out
 
 
