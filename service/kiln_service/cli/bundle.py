@@ -29,7 +29,7 @@ from kiln_schemas.errors import InputError
 from kiln_schemas.files import LeavesFolder, NotRegular, is_inside, open_inside
 from kiln_schemas.formats import CONVERTERS
 from kiln_schemas.job import check_bundle, check_bundle_path
-from kiln_schemas.tasks import Bundle, EnvironmentRef
+from kiln_schemas.tasks import PATH_LENGTH, Bundle, EnvironmentRef
 from kiln_schemas.text import told
 
 MAX_INCLUDES: Final = 64
@@ -313,7 +313,9 @@ class _MitsubaFiles:
         yield from self.references(path)
 
     def _filled(self, value: str) -> str:
-        return re.sub(r"\$(\w+)", lambda match: self.defaults.get(match[1], match[0]), value)
+        """A value with its variables, which is no file's name where it has become longer than one."""
+        filled = re.sub(r"\$(\w+)", lambda match: self.defaults.get(match[1], match[0]), value)
+        return filled[: PATH_LENGTH + 1]
 
     def _found(self, reference: str, name: str) -> str:
         """The bundle path of a name: the first that is there, else the first that stays in the folder."""
