@@ -284,9 +284,14 @@ class _MitsubaFiles:
         except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two of encodings
             detail = f"is not XML: {told(str(error), 80)}"
             raise InputError(detail, where=name, remedy="Export the scene again.") from None
-        yield from self._element(root, name)
+        waiting = [(root, True)]
+        while waiting:
+            node, used = waiting.pop()
+            yield from self._element(node, name, used)
+            waiting += [(child, used and child.tag not in MITSUBA_UNUSED) for child in reversed(node)]
 
-    def _element(self, node: ElementTree.Element, name: str, used: bool = True) -> References:
+    def _element(self, node: ElementTree.Element, name: str, used: bool) -> References:
+        """What one element names, without those in it."""
         if node.tag == "default":
             self.defaults.setdefault(node.get("name", ""), self._filled(node.get("value", "")))
         elif node.tag == "path":
@@ -299,8 +304,6 @@ class _MitsubaFiles:
             path = self._found(self._filled(node.get("value", "")), name)
             if used or is_inside(self.folder, path):
                 yield path, name
-        for child in node:
-            yield from self._element(child, name, used and child.tag not in MITSUBA_UNUSED)
 
     def _include(self, path: str, name: str) -> References:
         yield path, name
