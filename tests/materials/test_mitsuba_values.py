@@ -96,6 +96,8 @@ def test_other_bsdfs_have_a_counterpart(tmp_path):
     blend, said = material_of(tmp_path, f'<bsdf type="blendbsdf"><float name="weight" value="0.25"/>{red}{blue}</bsdf>')
     np.testing.assert_allclose(blend.base_color[:3], [0.6, 0.2, 0.1])
     assert "blendbsdf" in said
+    spots, _ = material_of(tmp_path, f'<bsdf type="blendbsdf">{paint.format("weight")}{red}{blue}</bsdf>')
+    assert spots.base_color_texture is not None
     for kind, child in (("bumpmap", paint.format("arbitrary")), ("roughdiffuse", ""), ("coating", red)):
         inner = (
             red

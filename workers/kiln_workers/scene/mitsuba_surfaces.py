@@ -343,22 +343,24 @@ def _blend(surfaces: Surfaces, plugin: Plugin) -> Surface | None:
         whole = pair[0] or pair[1]
         cover = share if pair[0] is None else share.mapped(lambda values: 1.0 - values)
         return None if whole is None else replace(whole, opacity=cover)
-    if share.image is not None:
-        surfaces.notes.append(f"{plugin.label}: the texture 'weight' is replaced by its mean.")
-    weight = share.level
     surfaces.notes.append(f"{plugin.label}: baked as one surface with the mean of both BSDFs' values.")
-    return _mixed(surfaces, pair[0], pair[1], weight)
+    return _mixed(surfaces, pair[0], pair[1], share)
 
 
-def _mixed(surfaces: Surfaces, first: Surface, second: Surface, weight: float) -> Surface:
+def _mixed(surfaces: Surfaces, first: Surface, second: Surface, share: Value) -> Surface:
+    weight = share.level
+
     def value(name: str) -> Value:
         one: Value = getattr(first, name)
         other: Value = getattr(second, name)
-        if one.image is None and other.image is None:
+        if one is other:
+            return one
+        if one.image is None and other.image is None and share.image is None:
             red, green, blue = ((1.0 - weight) * a + weight * b for a, b in zip(one.colour, other.colour, strict=True))
             return replace(one, colour=(red, green, blue))
-        (a, b), lookup = stacked((one, other), surfaces.notes, "BSDF 'blendbsdf'")
-        return Value((1.0, 1.0, 1.0), Image("blend", (1.0 - weight) * a + weight * b, False), lookup)
+        (w, a, b), lookup = stacked((share, one, other), surfaces.notes, "BSDF 'blendbsdf'")
+        w = (w @ _grey()).astype(np.float32)
+        return Value((1.0, 1.0, 1.0), Image("blend", (1.0 - w) * a + w * b, False), lookup)
 
     def level(name: str) -> float:
         return float((1.0 - weight) * getattr(first, name) + weight * getattr(second, name))

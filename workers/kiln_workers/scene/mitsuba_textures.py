@@ -4,7 +4,7 @@ A bitmap's rows count from v = 0, as `model` has it. `to_uv` has to be a scale a
 KHR_texture_transform has it: a shear is left out with a note. A checkerboard becomes an image.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -69,17 +69,18 @@ def number(value: float) -> Value:
     return Value((value, value, value))
 
 
-def stacked(values: tuple[Value, Value], notes: list[str], what: str) -> tuple[list[Float32], TextureRef]:
-    """The pixels [H, W, 3] of two values on one grid, and the look-up of both.
+def stacked(values: Sequence[Value], notes: list[str], what: str) -> tuple[list[Float32], TextureRef]:
+    """The pixels [H, W, 3] of values on one grid, and the look-up of all.
 
-    Where both are images that are looked up differently, the second is replaced by its mean, with a note.
+    An image that is looked up otherwise than the first one is replaced by its mean, with a note.
     """
-    first, second = values
-    if first.image is not None and second.image is not None and first.lookup != second.lookup:
-        notes.append(f"{what}: a texture that is placed otherwise than the one beside it is replaced by its mean.")
-        second = Value(second.mean)
-    lookup = second.lookup if first.image is None else first.lookup
-    grids = [value.pixels() for value in (first, second)]
+    lookup = next((value.lookup for value in values if value.image is not None), values[0].lookup)
+    grids = []
+    for value in values:
+        if value.image is not None and value.lookup != lookup:
+            notes.append(f"{what}: a texture that is placed otherwise than the one beside it is replaced by its mean.")
+            value = Value(value.mean)
+        grids.append(value.pixels())
     height, width = (max(grid.shape[axis] for grid in grids) for axis in (0, 1))
     return [
         grid[np.arange(height) * len(grid) // height][:, np.arange(width) * grid.shape[1] // width] for grid in grids
