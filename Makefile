@@ -4,12 +4,13 @@
 # make chaos  bakes under 200 faults: killed processes, cut wires, flipped bytes, set clocks (about an hour)
 # make hostile  thousands of attacks while another client bakes, then schemathesis at length (about half an hour)
 # make hostile-commands  every command of the command line with each option at odd values (about an hour)
+# make faults  bakes inputs that were once baked wrongly, against right values (about ten minutes)
 # make venv   the virtual environment in .venv that these use
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test hostile hostile-commands lint node chromium faketime chaos clean
+.PHONY: help venv demo test faults hostile hostile-commands lint node chromium faketime chaos clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -60,6 +61,9 @@ hostile: venv
 
 hostile-commands: venv
 	LIGHTKILN_HOSTILE_COMMANDS=100000 $(BIN)/pytest tests/hostile/test_commands_hostile.py -q -rP
+
+faults: venv
+	$(BIN)/python benchmarks/faults.py --json docs/results/faults.json --page docs/results/faults.md
 
 chaos: venv faketime
 	PYTHONPATH=$(FARM_TESTS) $(BIN)/python tests/chaos/chaos.py --store disk --faults 120 --json docs/results/chaos-disk.json
