@@ -208,7 +208,7 @@ class FitMetrics(Contract):
     log_mse_rel: Magnitude
     texels: Count
     signal: bool
-    """False where the function is zero everywhere and there is nothing to fit."""
+    """False where the function is zero everywhere, or too weak beside the irradiance to be fitted: it is left out."""
 
 
 class CurvePoint(Contract):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from kiln_schemas.conventions import EXPOSURE_KEY
 from kiln_schemas.errors import FitFailed, InputError
 from kiln_schemas.settings import FitSettings, Function
 from kiln_schemas.tasks import Progress
@@ -117,6 +118,18 @@ def test_darkness_is_no_failure(lobe_source: ArraySource) -> None:
         assert not outcome.metrics.signal and outcome.metrics.log_mse_rel == 0.0 and outcome.steps == 0
         lobes = predict(outcome.weights, dark._images[:3], dark._normals[:3])
         assert lobes.shape == (3, 4, 7) and (lobes[..., 4:] == 0.0).all() and (lobes[..., 3] > 0.0).all()
+
+
+def test_a_fit_that_collapses_on_what_nobody_would_see_is_left_out(lobe_source: ArraySource) -> None:
+    settings = FitSettings(lobes=4, steps=40, batch=10, learning_rate=1.0)
+    mean = EXPOSURE_KEY / exposure_of(lobe_source, LIGHT)
+    with pytest.raises(FitFailed):
+        train(lobe_source, settings, LIGHT, 0, least_radiance=0.99 * mean)
+    outcome = train(lobe_source, settings, LIGHT, 0, least_radiance=1.01 * mean)
+    assert not outcome.metrics.signal and outcome.metrics.log_mse == outcome.metrics.log_mse_zero > 0.0
+    lobes = predict(outcome.weights, lobe_source._images[:3], lobe_source._normals[:3])
+    assert (lobes[..., 4:] == 0.0).all()
+    assert train(lobe_source, SHORT, LIGHT, 0, least_radiance=1e9).metrics.signal, "what can be fitted is"
 
 
 def test_no_valid_texel_is_an_error() -> None:

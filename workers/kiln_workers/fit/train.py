@@ -9,7 +9,7 @@ come from (seed, step), the order of texels from `stream`, and a checkpoint hold
 import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any, Final, TypeVar
 
@@ -18,7 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kiln_schemas.conventions import LOBE_PARAMETERS
+from kiln_schemas.conventions import EXPOSURE_KEY, LOBE_PARAMETERS
 from kiln_schemas.errors import FitFailed, InputError
 from kiln_schemas.settings import FitSettings, Function
 from kiln_schemas.tasks import CurvePoint, FitMetrics, Progress
@@ -89,8 +89,12 @@ def train(
     exposure: float | None = None,
     on_epoch: Callable[[int, Weights], None] | None = None,
     start: Weights | None = None,
+    least_radiance: float = 0.0,
 ) -> FitOutcome:
     """Fit one function; FitFailed where it does not clearly beat P = 0, InputError where there are no texels.
+
+    A function whose mean luminance above the horizon is under `least_radiance` (W/(m^2 sr)) is left out instead: it is
+    too weak to be seen, and the network finds nothing in it.
 
     `exposure` is that of the source unless given; `on_epoch` is shown the weights after each pass over the texels;
     `start` is a network of the same shape to go on from, instead of random weights.
@@ -134,6 +138,11 @@ def train(
                 last_saved = time.monotonic()
         weights = _weights(shape, state)
         errors = _errors(source, weights, state.exposure, pool)
+    if _has_failed(errors) and EXPOSURE_KEY / state.exposure < least_radiance:
+        weights = replace(weights, signal=False)
+        metrics = _metrics(errors, signal=False).model_copy(update={"log_mse": errors.log_mse_zero, "log_mse_rel": 1.0})
+        seconds = time.monotonic() - began
+        return FitOutcome(weights.to_bytes(), state.exposure, metrics, tuple(state.curve), state.step, seconds)
     _refuse_failure(errors, function, settings)
     return FitOutcome(
         weights=weights.to_bytes(),
@@ -236,8 +245,12 @@ DARK: Final = 1e-5
 """Mean square of the logarithmic signal below which nearly all texels are black."""
 
 
+def _has_failed(errors: TexelErrors) -> bool:
+    return not errors.log_mse_rel <= FAILURE_RATIO  # also true for NaN
+
+
 def _refuse_failure(errors: TexelErrors, function: Function, settings: FitSettings) -> None:
-    if not errors.log_mse_rel <= FAILURE_RATIO:  # also true for NaN
+    if _has_failed(errors):
         raise FitFailed(
             f"the fit of the {function.value} ended at log_mse {errors.log_mse:.4g}, {errors.log_mse_rel:.0%} of the "
             f"{errors.log_mse_zero:.4g} that no light at all would have (at most {FAILURE_RATIO:.0%} is accepted)",

@@ -321,9 +321,19 @@ def _manifest(package: _Package) -> Manifest:
         stage_seconds={name: round(seconds, 3) for name, seconds in given.stage_seconds.items()},
         overflows=sum(render.overflows for render in payload.renders) + package.clamped,
         versions=dict(given.versions),
-        notes=payload.prepare.notes,
+        notes=(*payload.prepare.notes, *_weak_notes(given)),
         files=tuple(package.files),
     )
+
+
+def _weak_notes(given: PackageInput) -> list[str]:
+    """What is said of functions that were left out because they are too weak."""
+    return [
+        "Surfaces send each other so little light, under 1 % of what the light map receives, that no lobes fit it: "
+        "`lightfield.ktx2` is black."
+        for metrics in given.metrics.values()
+        if not metrics.signal and metrics.log_mse_zero > 0.0
+    ]
 
 
 def _left_out(given: PackageInput) -> dict[str, str]:
