@@ -45,6 +45,7 @@ def test_tags_bring_a_job_to_its_workers_and_its_log_is_followed(ask, lightkiln,
     beat = held | {"task_id": claim["task_id"], "log": "one\ntwo\nthree\n"}
     farm.post(f"/v1/workers/{tagged}/heartbeat", json=beat).raise_for_status()
     assert ask("logs", job, "--tail", "2")[0]["log"] == "two\nthree\n"
+    farm.post(f"/v1/workers/{tagged}/heartbeat", json=beat | {"log": ""}).raise_for_status()  # commands take seconds
     problem = {"title": "t", "status": 422, "detail": "it is no scene", "code": "input"}
     failure = held | {"problem": problem, "retryable": False}
     farm.post(f"/v1/tasks/{claim['task_id']}/fail", json=failure).raise_for_status()

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from kiln_schemas.settings import Function, make_settings
 from kiln_schemas.tasks import Tile
@@ -20,6 +20,8 @@ from kiln_workers.scene.texel_map import TexelMap, pack_texel_map
 from kiln_workers.sphere.gaussian import evaluate
 from kiln_workers.sphere.octahedral import pixel_directions
 from kiln_workers.store.light_field import LightFieldStore
+
+expect.set_options(timeout=60_000)  # milliseconds: a last resort, no bound on the machine's speed
 
 SCREENSHOTS = Path("test-artifacts/dashboard")
 NODE = Path(__file__).parent / "node"
