@@ -27,15 +27,11 @@ from pydantic import ValidationError
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.files import LeavesFolder, NotRegular, is_inside, open_inside
-from kiln_schemas.formats import CONVERTERS
+from kiln_schemas.formats import CONVERTERS, MITSUBA_INCLUDES, MITSUBA_UNUSED
 from kiln_schemas.job import check_bundle, check_bundle_path
 from kiln_schemas.tasks import PATH_LENGTH, Bundle, EnvironmentRef
 from kiln_schemas.text import told
 
-MAX_INCLUDES: Final = 64
-"""XML files that one scene includes, as many as the worker reads."""
-MITSUBA_UNUSED: Final = frozenset({"sensor", "integrator", "film", "sampler", "rfilter", "medium", "phase", "volume"})
-"""Elements of Mitsuba's XML whose files a bake does without."""
 GLB_MAGIC: Final = b"glTF"
 GLB_JSON: Final = b"JSON"
 MTL_OPTION_VALUES: Final[Mapping[str, int]] = {
@@ -309,8 +305,8 @@ class _MitsubaFiles:
         yield path, name
         if path in self.included:
             return
-        if len(self.included) > MAX_INCLUDES:
-            raise InputError(f"includes more than {MAX_INCLUDES} files", where=name, remedy="Include fewer.")
+        if len(self.included) > MITSUBA_INCLUDES:
+            raise InputError(f"includes more than {MITSUBA_INCLUDES} files", where=name, remedy="Include fewer.")
         self.included.append(path)
         _open(self.folder, path, name).close()
         yield from self.references(path)

@@ -89,12 +89,12 @@ def train(
     exposure: float | None = None,
     on_epoch: Callable[[int, Weights], None] | None = None,
     start: Weights | None = None,
-    least_radiance: float = 0.0,
+    least_radiance: Callable[[], float] = lambda: 0.0,
 ) -> FitOutcome:
     """Fit one function; FitFailed where it does not clearly beat P = 0, InputError where there are no texels.
 
-    A function whose mean luminance above the horizon is under `least_radiance` (W/(m^2 sr)) is left out instead: it is
-    too weak to be seen, and the network finds nothing in it.
+    A function whose mean luminance above the horizon is under `least_radiance` (W/(m^2 sr), asked for where the fit has
+    failed) is left out instead: it is too weak to be seen, and the network finds nothing in it.
 
     `exposure` is that of the source unless given; `on_epoch` is shown the weights after each pass over the texels;
     `start` is a network of the same shape to go on from, instead of random weights.
@@ -138,16 +138,16 @@ def train(
                 last_saved = time.monotonic()
         weights = _weights(shape, state)
         errors = _errors(source, weights, state.exposure, pool)
-    if _has_failed(errors) and EXPOSURE_KEY / state.exposure < least_radiance:
+    metrics = _metrics(errors, signal=True)
+    if _has_failed(errors):
+        if EXPOSURE_KEY / state.exposure >= least_radiance():
+            raise _failure(errors, function, settings)
         weights = replace(weights, signal=False)
-        metrics = _metrics(errors, signal=False).model_copy(update={"log_mse": errors.log_mse_zero, "log_mse_rel": 1.0})
-        seconds = time.monotonic() - began
-        return FitOutcome(weights.to_bytes(), state.exposure, metrics, tuple(state.curve), state.step, seconds)
-    _refuse_failure(errors, function, settings)
+        metrics = metrics.model_copy(update={"signal": False, "log_mse": errors.log_mse_zero, "log_mse_rel": 1.0})
     return FitOutcome(
         weights=weights.to_bytes(),
         exposure=state.exposure,
-        metrics=_metrics(errors, signal=True),
+        metrics=metrics,
         curve=tuple(state.curve),
         steps=state.step,
         seconds=time.monotonic() - began,
@@ -249,14 +249,13 @@ def _has_failed(errors: TexelErrors) -> bool:
     return not errors.log_mse_rel <= FAILURE_RATIO  # also true for NaN
 
 
-def _refuse_failure(errors: TexelErrors, function: Function, settings: FitSettings) -> None:
-    if _has_failed(errors):
-        raise FitFailed(
-            f"the fit of the {function.value} ended at log_mse {errors.log_mse:.4g}, {errors.log_mse_rel:.0%} of the "
-            f"{errors.log_mse_zero:.4g} that no light at all would have (at most {FAILURE_RATIO:.0%} is accepted)",
-            where=f"fit {function.value}",
-            remedy=_remedy(errors, function, settings),
-        )
+def _failure(errors: TexelErrors, function: Function, settings: FitSettings) -> FitFailed:
+    return FitFailed(
+        f"the fit of the {function.value} ended at log_mse {errors.log_mse:.4g}, {errors.log_mse_rel:.0%} of the "
+        f"{errors.log_mse_zero:.4g} that no light at all would have (at most {FAILURE_RATIO:.0%} is accepted)",
+        where=f"fit {function.value}",
+        remedy=_remedy(errors, function, settings),
+    )
 
 
 def _remedy(errors: TexelErrors, function: Function, settings: FitSettings) -> str:

@@ -282,18 +282,20 @@ def _rotation_to(direction: npt.NDArray[np.float64]) -> list[float]:
 
 def _unit_normals(normals: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Normals at unit length to float32 precision, which glTF demands; a normal of length 0 becomes +Y."""
-    exact = normals.astype(np.float64)
-    length = np.linalg.norm(exact, axis=1, keepdims=True)
-    unit = np.where(length > 0.0, exact / np.where(length > 0.0, length, 1.0), (0.0, 1.0, 0.0))
-    return np.asarray(unit, np.float32)
+    return np.asarray(_unit_or(normals, (0.0, 1.0, 0.0)), np.float32)
 
 
 def _unit_tangents(tangents: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Tangents of unit length with a hand of 1 or -1, which glTF demands; a tangent of length 0 becomes +X."""
     hand = np.where(tangents[:, 3:] < 0.0, -1.0, 1.0)
-    length = np.linalg.norm(tangents[:, :3].astype(np.float64), axis=1, keepdims=True)
-    unit = np.where(length > 0.0, tangents[:, :3] / np.where(length > 0.0, length, 1.0), (1.0, 0.0, 0.0))
-    return np.asarray(np.concatenate([unit, hand], axis=1), np.float32)
+    return np.asarray(np.concatenate([_unit_or(tangents[:, :3], (1.0, 0.0, 0.0)), hand], axis=1), np.float32)
+
+
+def _unit_or(vectors: npt.NDArray[np.float32], otherwise: tuple[float, float, float]) -> npt.NDArray[np.float64]:
+    """The vectors [V, 3] at unit length; `otherwise` in the place of those of length 0."""
+    exact = vectors.astype(np.float64)
+    length = np.linalg.norm(exact, axis=1, keepdims=True)
+    return np.where(length > 0.0, exact / np.where(length > 0.0, length, 1.0), otherwise)
 
 
 def _unit(value: float) -> float:

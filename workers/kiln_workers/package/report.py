@@ -101,10 +101,7 @@ def verdict(gates: Sequence[GateResult]) -> dict[str, Any] | None:
         return None
     worst = max(pictures, key=lambda gate: gate.value - (gate.noise_floor or 0.0))
     excess = worst.value - (worst.noise_floor or 0.0)
-    word, style = next(
-        ((word, style) for bound, word, style in _PICTURE_GRADES if excess < bound),
-        ("plainly different from the reference", "poor"),
-    )
+    word, style = _word_of(excess, _PICTURE_GRADES, "plainly different from the reference")
     camera = worst.name.removeprefix(FLIP)
     return {"word": word, "style": style, "camera": camera, "flip": worst.value, "noise": worst.noise_floor}
 
@@ -116,7 +113,12 @@ def grade(log_mse_rel: float, speck_share: float = 0.0) -> tuple[str, str]:
     """
     if speck_share > COARSE and log_mse_rel < _GRADES[3][0]:
         return "light map too coarse", "poor"
-    return next(((word, style) for bound, word, style in _GRADES if log_mse_rel < bound), ("failed", "poor"))
+    return _word_of(log_mse_rel, _GRADES, "failed")
+
+
+def _word_of(value: float, grades: Sequence[tuple[float, str, str]], beyond: str) -> tuple[str, str]:
+    """The word and style of the first bound that the value is under; `beyond`, in the style of poor, of none."""
+    return next(((word, style) for bound, word, style in grades if value < bound), (beyond, "poor"))
 
 
 def light_field_pictures(texel: TexelPreview, function: Function, exposure: float) -> tuple[UInt8, UInt8, UInt8]:

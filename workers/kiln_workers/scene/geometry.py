@@ -103,11 +103,15 @@ def check_mesh_count(count: int, where: str) -> None:
     check_count(count, MAX_MESHES, "objects with all its instances", where, "Join objects that share a material.")
 
 
+def unit(vectors: Floats) -> Floats:
+    """Vectors [..., 3] at unit length; zero stays zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0))
+
+
 def face_normals(positions: npt.NDArray[np.float32] | Floats, faces: npt.NDArray[np.integer]) -> Floats:
     """Unit geometric normals [F, 3], counter-clockwise outward; zero where a face has no area."""
-    cross = _double_areas(np.asarray(positions, dtype=np.float64), faces)
-    length = np.linalg.norm(cross, axis=1, keepdims=True)
-    return np.asarray(np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0))
+    return unit(_double_areas(np.asarray(positions, dtype=np.float64), faces))
 
 
 def face_areas(positions: npt.NDArray[np.float32] | Floats, faces: npt.NDArray[np.integer]) -> Floats:
@@ -116,14 +120,20 @@ def face_areas(positions: npt.NDArray[np.float32] | Floats, faces: npt.NDArray[n
     return np.asarray(0.5 * np.linalg.norm(cross, axis=1))
 
 
+def corner_angles(corners: Floats) -> Floats:
+    """Angle [F, 3] at each corner of triangles [F, 3, 3]; a right one at a side of no length."""
+    ahead = unit(np.roll(corners, -1, axis=1) - corners)
+    behind = unit(np.roll(corners, 1, axis=1) - corners)
+    return np.asarray(np.arccos(np.clip(np.einsum("fcd,fcd->fc", ahead, behind), -1.0, 1.0)))
+
+
 def smooth_normals(positions: Floats, faces: npt.NDArray[np.integer]) -> Floats:
     """Area-weighted unit vertex normals [V, 3]; zero at vertices that no face uses."""
     total = np.zeros((len(positions), 3))
     cross = _double_areas(positions, faces)
     for corner in range(3):
         np.add.at(total, faces[:, corner], cross)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0.0))
+    return unit(total)
 
 
 def unique_names(names: Iterable[str]) -> list[str]:

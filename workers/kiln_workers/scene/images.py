@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -114,5 +114,10 @@ def linearised(pixels: Float32) -> Float32:
     colours = pixels.shape[-1] - (pixels.shape[-1] + 1) % 2
     out = pixels.copy()
     part = pixels[..., :colours]
-    out[..., :colours] = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+    out[..., :colours] = linear_of_srgb(part)
     return out
+
+
+def linear_of_srgb(encoded: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """sRGB-encoded values as linear ones (IEC 61966-2-1), of any shape and float type."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4)

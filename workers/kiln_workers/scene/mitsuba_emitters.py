@@ -8,8 +8,9 @@ import numpy as np
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.environment import MITSUBA_TURN, read_environment
 from kiln_workers.scene.geometry import Floats
+from kiln_workers.scene.lookup import look_up
 from kiln_workers.scene.mitsuba_tree import Plugin
-from kiln_workers.scene.model import Environment, Float32, LightKind, PunctualLight
+from kiln_workers.scene.model import Environment, Float32, LightKind, PunctualLight, TextureRef
 
 ENVIRONMENTS: Final = ("envmap", "constant")
 LAMPS: Final = ("point", "spot", "directional")
@@ -17,6 +18,8 @@ SUBPIXELS: Final = 2
 """Along each side of a pixel of an environment that is turned about another axis than +Y."""
 ROWS: Final = 64
 """Of an environment that are turned at a time."""
+WRAPPED: Final = TextureRef(0, ("repeat", "clamp"))
+"""The last column is followed by the first; the poles are edges."""
 
 
 def environment(plugin: Plugin, folder: Path, notes: list[str]) -> Environment:
@@ -59,21 +62,10 @@ def turned(pixels: Float32, turn: Floats) -> Float32:
         x, y, z = np.moveaxis(local / np.linalg.norm(local, axis=-1, keepdims=True), -1, 0)
         u = np.arctan2(x, -z) / (2.0 * np.pi)
         v = np.arccos(np.clip(y, -1.0, 1.0)) / np.pi
-        found = _bilinear(pixels, u * width - 0.5, v * (height - 1))  # its first row lies at the pole
+        v = (v * (height - 1) + 0.5) / height  # its first row lies at the pole
+        found = look_up(pixels, WRAPPED, np.stack([u, v], axis=-1).reshape(-1, 2))
         out[first : first + ROWS] = found.reshape(-1, SUBPIXELS, width, SUBPIXELS, 3).mean(axis=(1, 3))
     return out
-
-
-def _bilinear(pixels: Float32, column: Floats, row: Floats) -> Floats:
-    height, width = pixels.shape[:2]
-    left, top = np.floor(column), np.floor(row)
-    total = np.zeros((*column.shape, 3))
-    for down in (0, 1):
-        for right in (0, 1):
-            weight = (1.0 - np.abs(column - left - right)) * (1.0 - np.abs(row - top - down))
-            rows = np.clip(top + down, 0, height - 1).astype(np.int64)
-            total += weight[..., None] * pixels[rows, (left + right).astype(np.int64) % width]
-    return total
 
 
 def lamp(plugin: Plugin, notes: list[str]) -> PunctualLight:

@@ -17,13 +17,13 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from kiln_schemas.errors import InputError
+from kiln_schemas.formats import MITSUBA_INCLUDES, MITSUBA_UNUSED
 from kiln_schemas.text import quoted
 from kiln_workers.scene.bundle import BundleFolder
+from kiln_workers.scene.images import linear_of_srgb
 from kiln_workers.scene.limits import MAX_ENTRIES, MAX_TEXT_BYTES, check_count
 from kiln_workers.scene.xml_nodes import Node, parse_xml
 
-MAX_INCLUDES: Final = 64
-"""Files that are included, over all; so a file may not include itself for ever."""
 MAX_VARIABLES: Final = 256
 MAX_VALUE: Final = 1 << 16
 """Characters of a value that names variables, once they are filled in: variables of variables grow without bound."""
@@ -32,7 +32,6 @@ MAX_CHARACTERS: Final = 1 << 28
 MAX_SPECTRUM_BYTES: Final = 1 << 16
 """Of a file of wavelengths and values."""
 OBJECTS: Final = frozenset({"shape", "bsdf", "emitter", "texture"})
-UNUSED: Final = frozenset({"sensor", "integrator", "film", "sampler", "rfilter", "medium", "phase", "volume"})
 VALUES: Final = frozenset(
     {"float", "integer", "boolean", "string", "rgb", "spectrum", "point", "vector", "transform", "ref", "alias"}
 )
@@ -106,7 +105,7 @@ class _Files:
             self._include(attributes, where, top)
         elif node.tag == "path":
             self.paths = [*self._folders(attributes.get("value", ""), where), *self.paths]
-        elif node.tag in UNUSED:
+        elif node.tag in MITSUBA_UNUSED:
             self._unused(node, attributes, where)
         elif node.tag in ("srgb", "blackbody") or node.tag in KNOWN:
             self._write(node, attributes, where)
@@ -117,7 +116,7 @@ class _Files:
 
     def _include(self, attributes: dict[str, str], where: str, top: bool) -> None:
         self.includes += 1
-        check_count(self.includes, MAX_INCLUDES, "included files", where)
+        check_count(self.includes, MITSUBA_INCLUDES, "included files", where)
         name = self._found(attributes.get("filename", ""), where, "included file")
         root = self.root(name)
         if root.tag == "scene":
@@ -224,9 +223,9 @@ class _Files:
                 )
             elif re.fullmatch(r"#[0-9a-fA-F]{6}", value):
                 encoded = [int(value[i : i + 2], 16) / 255.0 for i in (1, 3, 5)]
-                value, tag = _words(linear(np.array(encoded))), "rgb"
+                value, tag = _linear_words(encoded), "rgb"
             elif node.tag == "srgb":
-                value, tag = _words(linear(np.array([float(word) for word in _split(value)]))), "rgb"
+                value, tag = _linear_words([float(word) for word in _split(value)]), "rgb"
             elif attributes.get("type") in PAIR_SPECTRA:
                 tag, value = self._pairs(node, attributes["type"], where)
             elif node.tag == "spectrum" and "filename" in attributes:
@@ -285,12 +284,6 @@ def planck(kelvin: float, scale: float = 1.0) -> str:
     return _joined([float(wave) for wave in waves], [float(value) for value in values])
 
 
-def linear(encoded: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[float]:
-    """sRGB-encoded values as linear ones (IEC 61966-2-1)."""
-    values = np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4)
-    return [float(value) for value in values]
-
-
 def value_of(attributes: dict[str, str], name: str) -> str:
     """An attribute that has to be there; ValueError without it."""
     if name not in attributes:
@@ -310,6 +303,11 @@ def _joined(waves: list[float], values: list[float]) -> str:
 
 def _words(values: list[float]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
+
+
+def _linear_words(encoded: list[float]) -> str:
+    """sRGB-encoded values as linear ones."""
+    return _words(linear_of_srgb(np.array(encoded)).tolist())
 
 
 def _split(text: str) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from kiln_workers.scene.bundle import BundleFolder
-from kiln_workers.scene.geometry import Floats, Ints, RawMesh
+from kiln_workers.scene.geometry import Floats, Ints, RawMesh, corner_angles, face_normals
 from kiln_workers.scene.limits import MAX_FILE_BYTES, MAX_TEXT_BYTES
 from kiln_workers.scene.mitsuba_tree import Plugin
 from kiln_workers.scene.obj import parse_obj
@@ -59,16 +59,10 @@ def angle_normals(mesh: RawMesh) -> Floats | None:
     faces = mesh.faces
     if not len(faces) or faces.min() < 0 or faces.max() >= len(mesh.positions):
         return None
-    corners = mesh.positions[faces]  # [F, 3, 3]
-    with np.errstate(all="ignore"):
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal = cross / np.linalg.norm(cross, axis=1, keepdims=True)
-        total = np.zeros_like(mesh.positions)
-        for corner in range(3):
-            one = corners[:, (corner + 1) % 3] - corners[:, corner]
-            other = corners[:, (corner + 2) % 3] - corners[:, corner]
-            cosine = (one * other).sum(axis=1) / (np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1))
-            np.add.at(total, faces[:, corner], np.nan_to_num(normal * np.arccos(np.clip(cosine, -1, 1))[:, None]))
+    total = np.zeros_like(mesh.positions)
+    with np.errstate(all="ignore"):  # `place` refuses what is not finite
+        weighted = face_normals(mesh.positions, faces)[:, None] * corner_angles(mesh.positions[faces])[..., None]
+    np.add.at(total, faces, weighted)
     return total
 
 

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from kiln_workers.scene.geometry import corner_angles, unit
 from kiln_workers.scene.lookup import Floats, Ints, transformed
 from kiln_workers.scene.model import Mesh, Scene
 
@@ -52,7 +53,7 @@ def made(mesh: Mesh, uv: Floats) -> Mesh:
     tangent = np.where(lost[:, None], _across(normal), tangent)
     sign = np.where(pair % 2 == 1, -1.0, 1.0)[:, None]
     out = mesh.with_vertices(pair // 2, corner.astype(np.int32))
-    return replace(out, tangents=np.concatenate([_unit(tangent), sign], axis=1).astype(np.float32))
+    return replace(out, tangents=np.concatenate([unit(tangent), sign], axis=1).astype(np.float32))
 
 
 def _sums(mesh: Mesh, uv: Floats, group: Ints) -> Floats:
@@ -62,10 +63,10 @@ def _sums(mesh: Mesh, uv: Floats, group: Ints) -> Floats:
         corners = mesh.positions[mesh.faces[part]].astype(np.float64)  # [B, 3, 3]
         normals = mesh.normals[mesh.faces[part]].astype(np.float64)
         along = _face_tangents(corners, uv[mesh.faces[part]])[0][:, None]
-        share = _unit(
+        share = unit(
             along - np.einsum("fcd,fcd->fc", np.broadcast_to(along, normals.shape), normals)[..., None] * normals
         )
-        np.add.at(total, group[part], share * _angles(corners)[..., None])
+        np.add.at(total, group[part], share * corner_angles(corners)[..., None])
     return total
 
 
@@ -83,7 +84,7 @@ def _face_tangents(corners: Floats, uv: Floats) -> tuple[Floats, npt.NDArray[np.
     flat = np.abs(area) < 1e-12 * size * size
     along = np.sign(area)[:, None] * (e1 * dv2[:, None] - e2 * dv1[:, None])
     # v grows downwards: coordinates that are not mirrored run clockwise.
-    return np.where(flat[:, None], 0.0, _unit(along)), area > 0.0, flat
+    return np.where(flat[:, None], 0.0, unit(along)), area > 0.0, flat
 
 
 def _hands(mesh: Mesh, uv: Floats) -> Ints:
@@ -113,20 +114,7 @@ def _groups(mesh: Mesh, uv: Floats, pair: Ints) -> Ints:
     return np.unique(key, return_inverse=True)[1].reshape(-1)
 
 
-def _angles(corners: Floats) -> Floats:
-    """Angle [F, 3] at each corner of faces [F, 3, 3]."""
-    ahead = _unit(np.roll(corners, -1, axis=1) - corners)
-    behind = _unit(np.roll(corners, 1, axis=1) - corners)
-    return np.asarray(np.arccos(np.clip(np.einsum("fcd,fcd->fc", ahead, behind), -1.0, 1.0)))
-
-
 def _across(normal: Floats) -> Floats:
     """Some vectors [V, 3] across unit normals [V, 3]."""
     other = np.where(np.abs(normal[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     return np.cross(other, normal)
-
-
-def _unit(vectors: Floats) -> Floats:
-    """Unit vectors [..., 3]; zero stays zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0))

@@ -36,11 +36,13 @@ def run(payload: FitPayload, context: Context) -> FitResult:
     asked = payload.settings.fit
     settings = asked.model_copy(update={"steps": getattr(asked, asked.steps_key(payload.function))})
     covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles}
-    names = [payload.function.value, ARRAY_IRRADIANCE]
-    with store.all_lost(names, covered):
-        least = (
-            NEGLIGIBLE * _mean_radiance(store, tiles, texel_map) if payload.function is Function.LIGHT_FIELD else 0.0
-        )
+
+    def least_radiance() -> float:
+        if payload.function is not Function.LIGHT_FIELD:
+            return 0.0
+        return NEGLIGIBLE * _mean_radiance(store, tiles, texel_map)
+
+    with store.all_lost([payload.function.value, ARRAY_IRRADIANCE], covered):
         outcome = train(
             source,
             settings,
@@ -51,7 +53,7 @@ def run(payload: FitPayload, context: Context) -> FitResult:
             on_checkpoint=context.checkpoint,
             on_progress=on_progress,
             checkpoint_every_s=settings.checkpoint_s,
-            least_radiance=least,
+            least_radiance=least_radiance,
         )
     context.log(f"{payload.function.value}: log_mse_rel {outcome.metrics.log_mse_rel:.4f}")
     return FitResult(
