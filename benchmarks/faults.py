@@ -23,8 +23,6 @@ import numpy as np
 import torch
 import trimesh
 
-from kiln_workers.package.glb import encode_glb
-from kiln_workers.scene.model import Material, Mesh, Scene
 from kiln_workers.shade import textures
 from kiln_workers.shade.package import ShadePackage
 
@@ -155,7 +153,7 @@ CASES: Final = (
     ),
     Case(
         "07 a small thing of many triangles",
-        "marble.glb",
+        "marble.obj",
         "the same 100 times larger",
         (Probe((0.07, 0, 0), 0.704),),
         96,
@@ -225,7 +223,7 @@ class Outcome:
 def bake(case: Case, folder: Path) -> Outcome:
     """Bake a case as a user does, and compare."""
     path = DATA / case.file
-    if case.file == "marble.glb":
+    if case.file == "marble.obj":
         path = folder / case.file
         _write_marble(path)
     began = time.monotonic()
@@ -280,29 +278,26 @@ def irradiance_at(package: ShadePackage, probe: Probe) -> np.ndarray[Any, Any]:
 
 
 def _write_marble(path: Path) -> None:
-    """A marble of 6 cm with 25,280 triangles above a floor of 20 cm, under a lamp."""
+    """A marble of 6 cm with 25,280 triangles above a floor of 20 cm, under a lamp, as OBJ and MTL."""
     marble = trimesh.creation.uv_sphere(radius=0.03, count=[80, 160])
-    marble.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2.0, (1, 0, 0)))
-    lamp = Material("lamp", (0.0, 0.0, 0.0, 1.0), emission=(10.0, 10.0, 10.0))
-    meshes = (
-        Mesh(
-            "marble",
-            np.float32(marble.vertices + np.array([0.0, 0.035, 0.0])),
-            np.float32(marble.vertex_normals),
-            np.int32(marble.faces),
-            0,
-        ),
-        _square("floor", 0.1, 0.0, UP, 1),
-        _square("lamp", 0.03, 0.2, DOWN, 2),
+    quad = np.array([[0, 1, 2], [0, 2, 3]])
+    square = np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 0.0, -1.0]])
+    parts = (
+        ("marble", "grey", marble.vertices + np.array([0.0, 0.035, 0.0]), marble.faces),
+        ("floor", "black", 0.1 * square, quad),
+        ("lamp", "glow", 0.03 * square + np.array([0.0, 0.2, 0.0]), quad[:, ::-1]),
     )
-    grey, black = Material("grey", (0.5, 0.5, 0.5, 1.0)), Material("black", (0.0, 0.0, 0.0, 1.0))
-    path.write_bytes(encode_glb(Scene(meshes, (grey, black, lamp))))
-
-
-def _square(name: str, half: float, height: float, normal: tuple[float, float, float], material: int) -> Mesh:
-    corners = half * np.float32([[-1, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]]) + np.float32([0, height, 0])
-    faces = np.int32([[0, 1, 2], [0, 2, 3]])
-    return Mesh(name, corners, np.tile(np.float32(normal), (4, 1)), faces if normal == UP else faces[:, ::-1], material)
+    lines, first = ["mtllib marble.mtl"], 1
+    for name, material, vertices, faces in parts:
+        lines += [f"o {name}", f"usemtl {material}"]
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
+        lines += [f"f {a} {b} {c}" for a, b, c in faces + first]
+        first += len(vertices)
+    path.write_text("\n".join(lines) + "\n")
+    rough = "Ns 0\nillum 1\n"
+    grey, black = "newmtl grey\nKd 0.5 0.5 0.5\n", "newmtl black\nKd 0 0 0\n"
+    glow = "newmtl glow\nKd 0 0 0\nKe 10 10 10\n"
+    path.with_name("marble.mtl").write_text(f"{grey}{rough}{black}{rough}{glow}{rough}")
 
 
 def _shown(values: Any) -> str:
