@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -197,6 +198,22 @@ def test_progress_comes_by_itself_and_the_reader_keeps_the_place(home, dashboard
     expect(page.locator("#pick input[name=row]")).to_be_focused()
     expect(page.locator("#pick input[name=row]")).to_have_value("1")
     screenshot(page, "job-live")
+
+
+def test_a_page_whose_scripts_arrive_late_follows_all_the_same(home, dashboard, known_bake):
+    job = home.submit(name="late")["id"]
+    page = dashboard.open("/jobs")
+
+    def late(route):
+        time.sleep(3)  # a slow network, not a wait for something to happen
+        route.continue_()
+
+    page.route("**/htmx.min.js", late)
+    page.goto(f"{dashboard.url}/jobs/{job}")
+    bake, worker = known_bake(job), home.worker()
+    worker.finish(worker.must_claim(), tiles=4, texel_map=bake.texel_map)
+    expect(page.locator("#atlas-note")).to_contain_text("4 tiles: 4 queued")
+    expect(page.locator(".stages")).to_contain_text("0 / 4")
 
 
 def test_a_tile_that_failed_once_stands_out(home, dashboard, known_bake):
