@@ -64,7 +64,7 @@ def damaged_blobs(ground: Ground) -> Tally:
     """Blobs whose bytes rot on the coordinator's disk: never handed out as good, and mended by an upload."""
     tally = Tally()
     for number in range(ground.many(6, 40)):
-        good = hashlib.sha256(f"{ground.seed} {number}".encode()).digest() * (1 + number * 5000)
+        good = hashlib.sha256(f"{ground.seed} {number}".encode()).digest() * (1 + number * 1000)
         sha256 = hashlib.sha256(good).hexdigest()
         ground.owner.put(f"/v1/blobs/{sha256}", content=good).raise_for_status()
         path = next((ground.farm.folder / "data" / "blobs").rglob(sha256))
