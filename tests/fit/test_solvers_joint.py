@@ -13,12 +13,13 @@ from kiln_workers.fit.lobes import constrain
 from kiln_workers.fit.loss import reference_loss
 from kiln_workers.fit.metrics import horizon_weights
 from kiln_workers.fit.network import pixel_centres, solid_angles
+from kiln_workers.fit.optimizer import Moments, one_cycle
 from kiln_workers.fit.solution import Lobes, mixed_lobes
 from kiln_workers.fit.solvers import joint as module
 from kiln_workers.fit.solvers.alignment import Neighbourhood
 from kiln_workers.fit.solvers.evaluate import errors_at_texels, errors_between
 from kiln_workers.fit.solvers.joint import CoherentOptions, descend, mean_targets
-from kiln_workers.fit.solvers.starts import shared_start
+from kiln_workers.fit.solvers.starts import shared_start, unconstrain
 from kiln_workers.sphere import gaussian, octahedral
 
 SIZE = 16
@@ -88,26 +89,56 @@ def test_gradient_is_that_of_the_formulas(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(module, "_TEXELS", 5)
     monkeypatch.setattr(module, "_POINTS", 7)
     field, _ = floor(3, 4)
+    with ThreadPoolExecutor(2) as pool:
+        descent = module._Descent(field, anywhere(field), CoherentOptions(), 0, pool)
+        found = torch.from_numpy(descent.gradient(np.random.default_rng(1), 0.0))
+    torch.testing.assert_close(descent.lobes, anywhere(field), rtol=1e-4, atol=1e-5)
+    variable = descent.lobes.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(slow_loss(field, variable), variable)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+
+
+def anywhere(field: TexelField) -> torch.Tensor:
+    """Lobes [T, N, 7] off the start by random numbers."""
     raw = shared_start(field, LOBES)
     raw += 0.3 * torch.from_numpy(np.random.default_rng(0).standard_normal(raw.shape).astype(np.float32))
-    lobes = constrain(raw, torch.from_numpy(field.normals))
-    variable = lobes.clone().requires_grad_()
-    (expected,) = torch.autograd.grad(slow_loss(field, variable), variable)
-    with ThreadPoolExecutor(2) as pool:
-        problem = module._Problem(field, pool)
-        found = problem.gradient(lobes.detach(), np.random.default_rng(1))
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+    return constrain(raw, torch.from_numpy(field.normals))
+
+
+def test_steps_are_those_of_adam_by_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With every pixel in each step: parameters, alignment, schedule and moments as they are written elsewhere."""
+    monkeypatch.setattr(module, "_TEXELS", 5)
+    field, _ = floor(3, 4)
+    options = CoherentOptions(steps=6, rate=0.05)
+    normals = torch.from_numpy(field.normals)
+    raw = unconstrain(anywhere(field), normals)
+    moments = Moments(raw, module.EPSILON)
+    for step in range(options.steps):
+        variable = raw.clone().requires_grad_()
+        lobes = constrain(variable, normals)
+        alignment = 0.3 * (0.01 / 0.3) ** (step / options.steps)
+        leaf = lobes.detach().requires_grad_()
+        (gradient,) = torch.autograd.grad(slow_loss(field, leaf), leaf)
+        gradient[..., :3] += Neighbourhood(field).pull(leaf.detach()[..., :3], alignment)
+        (by_raw,) = torch.autograd.grad(lobes, variable, gradient)
+        mean, denominator, correction = moments.update(by_raw, step + 1)
+        raw -= one_cycle(step, options.steps, options.rate) / correction * mean / denominator
+    found = descend(field, anywhere(field), options, 0)
+    moved = (constrain(raw, normals) - anywhere(field)).abs().mean()
+    assert (found - constrain(raw, normals)).abs().mean() < 2e-3 * moved
 
 
 def test_random_subsets_have_the_whole_gradient_as_their_mean(monkeypatch: pytest.MonkeyPatch) -> None:
     field, _ = floor(2, 2)
     lobes = start_of(field)
     with ThreadPoolExecutor(1) as pool:
-        whole = module._Problem(field, pool).gradient(lobes, np.random.default_rng(0))
+        descent = module._Descent(field, lobes, CoherentOptions(), 0, pool)
+        whole = torch.from_numpy(descent.gradient(np.random.default_rng(0), 0.0))
         monkeypatch.setattr(module, "TEXEL_PIXELS", 32)
         monkeypatch.setattr(module, "BETWEEN_PIXELS", 8)
-        problem = module._Problem(field, pool)
-        drawn = torch.stack([problem.gradient(lobes, np.random.default_rng([1, k])) for k in range(400)])
+        descent = module._Descent(field, lobes, CoherentOptions(), 0, pool)
+        rngs = (np.random.default_rng([1, k]) for k in range(400))
+        drawn = torch.stack([torch.from_numpy(descent.gradient(rng, 0.0)) for rng in rngs])
     error = drawn.std(dim=0) / math.sqrt(len(drawn))
     assert (drawn.std(dim=0) > 0.0).any()
     z = ((drawn.mean(dim=0) - whole) / error.clamp(min=1e-9)).abs()

@@ -42,13 +42,17 @@ def amplitude_scale(factor: float) -> Tensor:
 def constrain(raw: Tensor, normals: Tensor) -> Tensor:
     """Lobes [T, N, 7] in exposure-normalised radiance from outputs [T, N, 7] and unit normals [T, 3]."""
     count = raw.shape[1]
-    start = fibonacci_axes(count).to(raw.device)
-    below = (normals @ start.T).clamp(max=0.0)  # [T, N]
-    folded = start - 2.0 * below[..., None] * normals[:, None, :]
-    axis = torch.nn.functional.normalize(folded + raw[..., :3], dim=-1, eps=1e-6)
+    axis = torch.nn.functional.normalize(start_axes(count, normals) + raw[..., :3], dim=-1, eps=1e-6)
     sharpness = _bounded_exp(raw[..., 3:4], math.log(max(count, 2)), LOG_SHARPNESS)
     amplitude = _bounded_exp(raw[..., 4:LOBE_PARAMETERS], math.log(START_AMPLITUDE), LOG_AMPLITUDE)
     return torch.cat([axis, sharpness, amplitude], dim=-1)
+
+
+def start_axes(count: int, normals: Tensor) -> Tensor:
+    """The axes [T, N, 3] at parameters of 0: spread over the sphere, folded at the tangent plane of normals [T, 3]."""
+    start = fibonacci_axes(count).to(normals.device)
+    below = (normals @ start.T).clamp(max=0.0)  # [T, N]
+    return start - 2.0 * below[..., None] * normals[:, None, :]
 
 
 def _bounded_exp(raw: Tensor, start: float, bounds: tuple[float, float]) -> Tensor:

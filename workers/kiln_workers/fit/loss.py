@@ -3,7 +3,8 @@
 loss = sum over texels, pixels and channels of w (log(1 + P) - log(1 + T))^2, P the sum of lobes in a direction
 drawn inside each pixel, w the pixel's solid angle where both its centre and that direction are above the texel's
 horizon, else 0. One step evaluates the same directions for all texels, so lambda (v.u - 1) of all pixels and lobes is
-one matrix product; the paper's appendix A gives the derivatives. `reference_loss` is the same by plain autograd.
+one matrix product; the paper's appendix A gives the derivatives. On the CPU `fit.fused` does all of it in one pass;
+`reference_loss` is the same by plain autograd.
 """
 
 from typing import Any
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
+from kiln_workers.fit.fused import losses_and_gradient
 from kiln_workers.fit.network import pixel_centres, solid_angles
 from kiln_workers.sphere import octahedral
 
@@ -63,6 +65,11 @@ class _LogLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, lobes: Tensor, log_targets: Tensor, directions: Tensor, weights: Tensor) -> Tensor:
+        if lobes.device.type == "cpu" and lobes.dtype == torch.float32:
+            index = torch.arange(len(directions), dtype=torch.int32).expand(weights.shape)
+            losses, gradient = losses_and_gradient(lobes, log_targets, directions, index, weights)
+            ctx.save_for_backward(gradient)
+            return losses.sum()
         values, predicted = lobe_values(lobes, directions)
         difference = torch.log1p(predicted) - log_targets
         weighted = difference * weights[..., None]

@@ -21,10 +21,11 @@ other, with a margin of their neighbours' texels that is dropped afterwards, agr
 docs/design/fit.md has the measurements behind every number here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -32,18 +33,19 @@ from torch import Tensor
 
 from kiln_schemas.settings import FitSettings
 from kiln_workers.fit.field import TexelField, TracedBetween
-from kiln_workers.fit.lobes import constrain
+from kiln_workers.fit.fused import losses_and_gradient
+from kiln_workers.fit.lobes import constrain, start_axes
 from kiln_workers.fit.metrics import horizon_weights
 from kiln_workers.fit.network import pixel_centres, solid_angles
-from kiln_workers.fit.optimizer import Moments, one_cycle
-from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, mixed_lobes, nobody
-from kiln_workers.fit.solvers.alignment import Neighbourhood
+from kiln_workers.fit.optimizer import one_cycle
+from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, nobody
 from kiln_workers.fit.solvers.encoder import SETTINGS, cnn
-from kiln_workers.fit.solvers.losses import texel_losses
+from kiln_workers.fit.solvers.joint_steps import Moving, add_gathered, add_pull, mix, unmix
+from kiln_workers.fit.solvers.losses import NORMALISATION
 from kiln_workers.fit.solvers.pixels import Pixels, split, with_weight
 from kiln_workers.fit.solvers.starts import unconstrain
 from kiln_workers.fit.solvers.stopwatch import Stopwatch
-from kiln_workers.fit.source import Index
+from kiln_workers.fit.source import Float32, Index
 from kiln_workers.fit.threads import single_threaded_pool
 from kiln_workers.sphere import octahedral
 
@@ -110,71 +112,123 @@ def descend(
     """
     if not len(field):
         return start.clone()
-    normals = torch.from_numpy(field.normals)
     with single_threaded_pool(threads) as pool:
-        problem, neighbourhood = _Problem(field, pool), Neighbourhood(field)
-        raw = unconstrain(start, normals)
-        moments = Moments(raw, EPSILON)
+        descent = _Descent(field, start, options, seed, pool)
         for step in range(options.steps):
-            rng = np.random.default_rng([seed, _STREAM, step])
-            fraction = step / options.steps
-            alignment = options.alignment[0] * (options.alignment[1] / options.alignment[0]) ** fraction
-            variable = raw.detach().requires_grad_()
-            lobes = constrain(variable, normals)
-            gradient = problem.gradient(lobes.detach(), rng)
-            gradient[..., :3] += neighbourhood.pull(lobes.detach()[..., :3], alignment)
-            (by_raw,) = torch.autograd.grad(lobes, variable, gradient)
-            mean, denominator, correction = moments.update(by_raw, step + 1)
-            raw.addcdiv_(mean, denominator, value=-one_cycle(step, options.steps, options.rate) / correction)
-            on_step(step + 1, raw)
-        return constrain(raw, normals)
+            descent.step(step)
+            on_step(step + 1, descent.raw)
+    return constrain(descent.raw, torch.from_numpy(field.normals))
 
 
-class _Problem:
-    """The loss of a field: its pixels, gathered once, and its gradient by lobes."""
+@dataclass(frozen=True)
+class _Part:
+    """Texels or between points in a row, and the pixels that the steps look at by turns."""
 
-    def __init__(self, field: TexelField, pool: ThreadPoolExecutor) -> None:
-        self._pool = pool
+    where: slice
+    turns: list[Pixels]
+    """Each has another one of as many pixels in a row, with that many times the weight."""
+
+    @classmethod
+    def of(cls, chosen: Index, pixels: Pixels, least: int) -> "_Part":
+        stride = max(1, pixels.index.shape[1] // least)
+        turns = [pixels.every(stride, first, stride) for first in range(stride)]
+        return cls(slice(int(chosen[0]), int(chosen[-1]) + 1), turns)
+
+    def turn(self, rng: np.random.Generator) -> Pixels:
+        """The pixels of one step."""
+        return self.turns[int(rng.integers(len(self.turns)))]
+
+
+class _Descent:
+    """The parameters of all texels, and what a step needs: pixels, gathered once, and running means of the gradient.
+
+    Texels and between points are cut into parts whatever the number of threads; each part is one thread's.
+    """
+
+    def __init__(
+        self, field: TexelField, start: Tensor, options: CoherentOptions, seed: int, pool: ThreadPoolExecutor
+    ) -> None:
+        self._options, self._seed, self._pool = options, seed, pool
+        self._table = pixel_centres(field.image_size)
+        normals = torch.from_numpy(field.normals)
+        raw = unconstrain(start, normals).contiguous()
+        self._moving = Moving.start(raw.numpy(), start_axes(raw.shape[1], normals).numpy(), EPSILON)
         texels = split(len(field), _TEXELS)
-        self._texels = list(zip(texels, pool.map(lambda part: _gather_continued(field, part), texels), strict=True))
+        self._texels = [
+            _Part.of(part, pixels, TEXEL_PIXELS)
+            for part, pixels in zip(texels, pool.map(partial(_gather_continued, field), texels), strict=True)
+        ]
         targets = field.traced if field.traced is not None else mean_targets(field)
-        self._corners = torch.from_numpy(field.between.corners[targets.points])
         points = split(len(targets), _POINTS)
-        found = pool.map(lambda part: _gather_between(field, targets, part), points)
-        self._points = list(zip(points, found, strict=True))
+        self._points = [
+            _Part.of(part, pixels, BETWEEN_PIXELS)
+            for part, pixels in zip(points, pool.map(partial(_gather_between, field, targets), points), strict=True)
+        ]
+        self._by_points = np.empty((len(targets), *raw.shape[1:]), np.float32)
+        self._corners = np.ascontiguousarray(field.between.corners[targets.points])
+        order = np.argsort(self._corners.ravel(), kind="stable")
+        self._points_of = order // 4
+        self._starts = np.searchsorted(self._corners.ravel()[order], np.arange(len(field) + 1))
+        self._beside = np.concatenate([np.arange(len(field))[:, None], field.neighbours], axis=1)
 
-    def gradient(self, lobes: Tensor, rng: np.random.Generator) -> Tensor:
-        """[T, N, 7] of both losses by lobes [T, N, 7], from a random subset of the pixels."""
-        out = torch.empty_like(lobes)
-        self._add_up(out, lobes, self._texels, TEXEL_PIXELS, rng)
-        if self._points:
-            variable = lobes.detach().requires_grad_()
-            mixed = mixed_lobes(variable, self._corners, lobes.new_full((len(self._corners), 4), 0.25))
-            by_mixed = torch.empty_like(mixed)
-            self._add_up(by_mixed, mixed.detach(), self._points, BETWEEN_PIXELS, rng)
-            out += torch.autograd.grad(mixed, variable, by_mixed)[0]
+    @property
+    def raw(self) -> Tensor:
+        """The parameters [T, N, 7] as they are."""
+        return torch.from_numpy(self._moving.raw)
+
+    @property
+    def lobes(self) -> Tensor:
+        """The lobes [T, N, 7] that the last gradient was taken at."""
+        return torch.from_numpy(self._moving.lobes)
+
+    def step(self, step: int) -> None:
+        """One step from 0 on: `raw` moves."""
+        options, rng = self._options, np.random.default_rng([self._seed, _STREAM, step])
+        alignment = options.alignment[0] * (options.alignment[1] / options.alignment[0]) ** (step / options.steps)
+        rate = one_cycle(step, options.steps, options.rate)
+        gradient = self.gradient(rng, alignment)
+        self._each(lambda part: self._moving.move(part.where, gradient[part.where], rate, step + 1), self._texels)
+
+    def gradient(self, rng: np.random.Generator, alignment: float) -> Float32:
+        """The gradient [T, N, 7] of the whole sum by the lobes as they are, from pixels that `rng` draws."""
+        texels = [part.turn(rng) for part in self._texels]
+        points = [part.turn(rng) for part in self._points]
+        out = np.empty_like(self._moving.lobes)
+
+        def learn(part: _Part, pixels: Pixels) -> None:
+            gradient = self._by_loss(self._moving.lobes[part.where], pixels)
+            add_gathered(
+                gradient, self._by_points, self._starts[part.where.start : part.where.stop + 1], self._points_of
+            )
+            add_pull(gradient, self._moving.lobes, self._beside[part.where], np.float32(alignment))
+            out[part.where] = gradient
+
+        self._each(lambda part: self._moving.constrain(part.where), self._texels)
+        self._each(self._learn_between, self._points, points)
+        self._each(learn, self._texels, texels)
         return out
 
-    def _add_up(
-        self,
-        out: Tensor,
-        lobes: Tensor,
-        parts: list[tuple[Index, Pixels]],
-        pixels: int,
-        rng: np.random.Generator,
-    ) -> None:
-        """Fill `out` [M, N, 7] with the gradients by `lobes` [M, N, 7], chunk by chunk."""
-        strides = [max(1, part.index.shape[1] // pixels) for _, part in parts]
-        firsts = [int(rng.integers(stride)) for stride in strides]
-
-        def work(number: int) -> None:
-            (where, part), stride, first = parts[number], strides[number], firsts[number]
-            chosen = part.every(stride, first)
-            at = slice(int(where[0]), int(where[-1]) + 1)
-            out[at] = texel_losses(lobes[at], chosen.log_targets, chosen.centres(), chosen.weights * stride)[1]
-
-        for _ in self._pool.map(work, range(len(parts))):
+    def _each(self, work: Callable[..., None], *parts: Sequence[Any]) -> None:
+        for _ in self._pool.map(work, *parts):
             pass
+
+    def _learn_between(self, part: _Part, pixels: Pixels) -> None:
+        """Write the gradient of some between points by the lobes of each of their corners."""
+        lobes, corners = self._moving.lobes, self._corners[part.where]
+        mixed = np.empty((len(corners), *lobes.shape[1:]), np.float32)
+        mix(lobes, corners, mixed)
+        gradient = self._by_loss(mixed, pixels)
+        unmix(lobes, corners, gradient)
+        self._by_points[part.where] = gradient
+
+    def _by_loss(self, lobes: Float32, pixels: Pixels) -> Float32:
+        """The gradient [M, N, 7] of the log loss by lobes [M, N, 7]."""
+        _, gradient = losses_and_gradient(
+            torch.from_numpy(lobes),
+            *(pixels.log_targets, self._table, pixels.index, pixels.weights),
+            1.0 / NORMALISATION,
+        )
+        return gradient.numpy()
 
 
 def mean_targets(field: TexelField) -> TracedBetween:

@@ -11,6 +11,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from kiln_workers.fit.fused import losses_and_gradient
 from kiln_workers.fit.lobes import constrain
 
 NORMALISATION: Final = 2.0 * math.pi * 3.0
@@ -18,6 +19,16 @@ NORMALISATION: Final = 2.0 * math.pi * 3.0
 
 def texel_losses(lobes: Tensor, log_targets: Tensor, directions: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Loss [T] and its gradient [T, N, 7] by lobes [T, N, 7]; log(1 + T) and directions [T, K, 3], weights [T, K]."""
+    if lobes.dtype == torch.float32 and lobes.device.type == "cpu":
+        index = torch.arange(weights.numel(), dtype=torch.int32).view(weights.shape)
+        return losses_and_gradient(lobes, log_targets, directions.flatten(0, 1), index, weights, 1.0 / NORMALISATION)
+    return reference_texel_losses(lobes, log_targets, directions, weights)
+
+
+def reference_texel_losses(
+    lobes: Tensor, log_targets: Tensor, directions: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """`texel_losses` as products of matrices, in any precision and on any device."""
     axis, sharpness, amplitude = lobes[..., :3], lobes[..., 3:4], lobes[..., 4:]
     scaled = torch.cat([axis * sharpness, sharpness], dim=-1)
     homogeneous = torch.cat([directions, -torch.ones_like(directions[..., :1])], dim=-1)  # [T, K, 4]

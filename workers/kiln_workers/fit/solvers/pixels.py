@@ -61,12 +61,11 @@ class Pixels:
             self.size, self.index[chosen], self.weights[chosen], self.log_targets[chosen], self.normals[chosen]
         )
 
-    def every(self, stride: int, first: int) -> "Pixels":
-        """One pixel of each `stride` in a row, from `first` on; the weights stay as they are."""
+    def every(self, stride: int, first: int, factor: float = 1.0) -> "Pixels":
+        """One pixel of each `stride` in a row, from `first` on, with `factor` times the weight."""
         chosen = slice(first, None, stride)
-        return Pixels(
-            self.size, self.index[:, chosen], self.weights[:, chosen], self.log_targets[:, chosen], self.normals
-        )
+        index, weights = self.index[:, chosen].contiguous(), factor * self.weights[:, chosen]
+        return Pixels(self.size, index, weights, self.log_targets[:, chosen].contiguous(), self.normals)
 
     def _look_up(self, table: Tensor) -> Tensor:
         return table.index_select(0, self.index.flatten()).view(*self.index.shape, 3)
