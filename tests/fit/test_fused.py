@@ -5,9 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from numba.core import caching
 
 from kiln_workers.fit.fused import PIXELS, losses_and_gradient
 from kiln_workers.fit.loss import log_loss, reference_loss
+from kiln_workers.fit.machine_code import SINGLE, compiled
 from kiln_workers.fit.solvers.losses import NORMALISATION, reference_texel_losses, texel_losses
 
 
@@ -113,3 +115,17 @@ def test_the_networks_loss_is_the_same_sum() -> None:
     (expected,) = torch.autograd.grad(3.0 * right, double)
     assert float(loss.detach()) == pytest.approx(float(right.detach()), rel=1e-6)
     assert relative(gradient, expected) < 1e-5
+
+
+def test_it_works_where_machine_code_cannot_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as in a container whose files cannot be written to."""
+    monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
+    out = np.zeros(1, np.float32)
+
+    @compiled(SINGLE[::1])
+    def double(values: np.ndarray) -> None:
+        values[0] = 2.0 * values[0]
+
+    out[0] = 3.0
+    double(out)
+    assert out[0] == 6.0
