@@ -30,7 +30,7 @@ from kiln_schemas import __version__
 from kiln_service.app import create_app
 from kiln_service.config import Limits, ServiceConfig
 from kiln_service.embedded import EmbeddedPostgres
-from kiln_service.serve import server_config
+from kiln_service.serve import server_config, spare_what_stays
 
 TILE = 8
 STEP_S = 0.005
@@ -166,6 +166,7 @@ async def serve(config: ServiceConfig, tiles: int) -> tuple[list[dict[str, Any]]
         running = asyncio.create_task(server.serve(sockets=[listening]))
         while not server.started:
             await asyncio.sleep(0.05)
+        spare_what_stays()
         url = f"http://127.0.0.1:{listening.getsockname()[1]}"
         words = [sys.executable, __file__, "--ask", url, (config.data / "token").read_text().strip()]
         sampling = asyncio.create_task(sample(late))

@@ -8,6 +8,7 @@ import argparse
 import asyncio
 import contextlib
 import fcntl
+import gc
 import json
 import logging
 import os
@@ -157,6 +158,7 @@ def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json:
         announce = json.dumps(ready) if as_json else f"lightkiln serves {url} (token {where})"
         app = create_app(config)
         server = Server(app, server_config(app, config), announce, database)
+        spare_what_stays()
         # uvicorn ends the process where the application does not start; the sentence below is ours.
         with _quiet_signals(), contextlib.suppress(SystemExit):
             asyncio.run(server.serve_all([listening]))
@@ -172,6 +174,17 @@ def _serve(config: ServiceConfig, database: EmbeddedPostgres | None, *, as_json:
             "the coordinator could not start", remedy="Check --database; the log on standard error says more."
         )
     return 0
+
+
+def spare_what_stays() -> None:
+    """Keep the garbage collector from looking at modules and the application, which stay until the end.
+
+    A full collection looked at some hundred thousand of their objects, and nobody was served for 0.1 s to 0.6 s. It
+    also comes less often now: reading a result of 65,536 tiles makes more objects than a day of other requests.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 def server_config(app: FastAPI, config: ServiceConfig) -> uvicorn.Config:
