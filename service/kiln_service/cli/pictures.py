@@ -63,6 +63,19 @@ def reference(
     env_rotation: options.EnvironmentRotation = 0.0,
     size: Size = "480x270",
     samples: Annotated[int, typer.Option("--samples", min=1, help="Paths a pixel, both halves together.")] = 256,
+    noise: Annotated[
+        float | None,
+        typer.Option(
+            "--noise",
+            min=1e-4,
+            max=1.0,
+            help="Instead of --samples: paths where they are needed, until the standard error of every 8 x 8 pixels, "
+            "as a display shows them (0 black, 1 white), is at most this; 0.02 is clean to the eye.",
+        ),
+    ] = None,
+    max_samples: Annotated[
+        int, typer.Option("--max-samples", min=1, help="Paths a pixel at most, with --noise.")
+    ] = 16384,
     max_depth: Annotated[int, typer.Option("--max-depth", min=1, help="Scattering events of a path.")] = 12,
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
     white: White = None,
@@ -71,6 +84,7 @@ def reference(
 ) -> None:
     """Path-trace a scene, and state the noise of the picture from two halves."""
     flags = {"--camera": camera, "--out": out, "--size": size, "--samples": samples, "--max-depth": max_depth}
+    flags |= {"--noise": noise, "--max-samples": max_samples}
     flags |= {"--env": env, "--env-scale": env_scale, "--env-rotation": env_rotation, "--seed": seed}
     flags |= {"--white": white, "--device": device}
     _run("reference", scene, flags, json)

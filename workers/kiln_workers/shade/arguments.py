@@ -29,8 +29,8 @@ def add_commands(commands: Any) -> None:
     tracing.add_argument("--env-scale", type=float, default=1.0)
     tracing.add_argument("--env-rotation", type=float, default=0.0, help="degrees about +Y")
     tracing.add_argument("--samples", type=_positive, default=256, help="paths a pixel, both halves together")
-    tracing.add_argument("--noise", type=_luminance, help="trace until the RMS noise over the mean is at most this")
-    tracing.add_argument("--most-samples", type=_positive, default=16384, help="paths a pixel at most, with --noise")
+    tracing.add_argument("--noise", type=_noise, help="paths where they are needed, until the noise is at most this")
+    tracing.add_argument("--max-samples", type=_positive, default=16384, help="paths a pixel at most, with --noise")
     tracing.add_argument("--max-depth", type=_positive, default=12, help="scattering events of a path")
     tracing.add_argument("--seed", type=_natural, default=0)
     tracing.set_defaults(command=_run_reference)
@@ -70,6 +70,13 @@ def _natural(text: str) -> int:
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError("must be 0 or more")
+    return value
+
+
+def _noise(text: str) -> float:
+    value = float(text)
+    if not 1e-4 <= value <= 1.0:
+        raise argparse.ArgumentTypeError("must be from 0.0001 to 1")
     return value
 
 

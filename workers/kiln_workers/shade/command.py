@@ -19,12 +19,14 @@ from kiln_workers.scene.environment import place_environment, read_environment
 from kiln_workers.scene.load import check_light, load_scene
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.sheets import part_sheets
+from kiln_workers.shade.adaptive import AdaptiveSampler, measured_noise
 from kiln_workers.shade.gbuffer import render_gbuffer
 from kiln_workers.shade.image_files import check_output, write_picture
 from kiln_workers.shade.image_metrics import compare_pictures, flip_noise_floor, psnr
 from kiln_workers.shade.package import ShadePackage, read_exr
 from kiln_workers.shade.picture import shade
 from kiln_workers.shade.reference import ReferenceTracer
+from kiln_workers.shade.sampling_line import SamplingLine
 from kiln_workers.shade.stored import StoredImages
 from kiln_workers.shade.term import Term
 
@@ -73,26 +75,39 @@ def run_reference(options: argparse.Namespace) -> int:
     scene = check_light(read_scene(options.scene, options.env, options.env_scale, options.env_rotation))
     began = time.perf_counter()
     tracer = ReferenceTracer(scene, camera, width, height, options.max_depth, options.device)
+    sampled: dict[str, Any] = {}
     if options.noise is None:
-        made = tracer.render(options.samples, options.seed)
+        reference = tracer.render(options.samples, options.seed)
     else:
-        made = tracer.render_until(options.noise, options.samples, options.most_samples, options.seed)
-    white = options.white or colour.white_point(made.picture)
-    write_picture(out, made.picture, white)
-    told = {
+        with SamplingLine(options.noise) as line:
+            found = AdaptiveSampler(tracer, options.noise, options.max_samples, options.seed, line.show).run()
+        reference = found.reference
+        sampled = {
+            "noise_asked": options.noise,
+            "noise_reached": found.reached,
+            "noise_of_worst_tile": float(found.tile_noise.max()),
+            "tiles_over_noise": float((found.tile_noise > options.noise).mean()),
+            "most_samples": int(found.paths.max()),
+            "max_samples": options.max_samples,
+            "scout_samples": round(float(found.scouts.mean())),
+        }
+    white = options.white or colour.white_point(reference.picture)
+    write_picture(out, reference.picture, white)
+    result = {
         "out": str(out),
         "width": width,
         "height": height,
-        "samples": made.samples,
+        "samples": reference.samples,
+        **sampled,
         "max_depth": options.max_depth,
-        "psnr_of_halves": _finite(psnr(*made.halves, white)),
-        "rms_noise": made.rms_noise,
-        "noise_reached": options.noise is None or made.rms_noise <= options.noise,
-        "flip_noise_floor": round(float(flip_noise_floor(made.halves).mean()), 5),
+        "psnr_of_halves": _finite(psnr(*reference.halves, white)),
+        "noise": measured_noise(reference, white),
+        "rms_noise": reference.rms_noise,
+        "flip_noise_floor": round(float(flip_noise_floor(reference.halves).mean()), 5),
         "white": white,
         "seconds": round(time.perf_counter() - began, 3),
     }
-    _tell(told, options.json)
+    _tell(result, options.json)
     return 0
 
 
@@ -153,7 +168,10 @@ def _tell(told: dict[str, Any], as_json: bool) -> None:
         "ssim": "SSIM: {}",
         "flip": "HDR-FLIP: {}",
         "psnr_of_halves": "PSNR between two halves: {} dB",
-        "rms_noise": "noise of the picture (RMS over mean): {}",
+        "samples": "paths a pixel, on average: {}",
+        "noise": "noise, as a share of the display's range: {:.4f}",
+        "noise_of_worst_tile": "of the worst 8 x 8 pixels: {:.4f}",
+        "rms_noise": "RMS of the noise over the mean radiance: {:.4f}",
         "flip_noise_floor": "HDR-FLIP that this noise alone makes: {}",
         "seconds": "seconds: {}",
     }
@@ -161,4 +179,7 @@ def _tell(told: dict[str, Any], as_json: bool) -> None:
         if key in told:
             print(sentence.format(told[key]))
     if not told.get("noise_reached", True):
-        print(f"The noise that was asked for is not reached with {told['samples']} paths a pixel (--most-samples).")
+        print(
+            f"Noise {told['noise_asked']:g} is not reached: {told['tiles_over_noise']:.1%} of the picture has more "
+            f"with {told['most_samples']} paths a pixel at most. Raise --max-samples or --noise."
+        )

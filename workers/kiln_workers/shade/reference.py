@@ -6,15 +6,16 @@ its shadow rays pass through what is cut out of a surface. Mitsuba's rays start 
 scene of metres, so a small scene is enlarged first: radiance does not change with the unit of length.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from kiln_schemas.camera import Camera
+from kiln_schemas.errors import InternalError
 from kiln_workers.render.backend import Device, select_variant
-from kiln_workers.render.jit import mi
+from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.mitsuba_scene import scene_diagonal, to_mitsuba
 from kiln_workers.scene.model import Float32, LightKind, PunctualLight, Scene
 from kiln_workers.scene.origin import Point, local_camera
@@ -100,20 +101,27 @@ class ReferenceTracer:
             halves.append((total / each).astype(np.float32))
         return Reference((halves[0], halves[1]), 2 * each)
 
-    def render_until(
-        self, noise: float, samples: int, most: int, seed: int = 0, on_round: Callable[[Reference], None] | None = None
-    ) -> Reference:
-        """Rounds of paths, each as many as all before, until `rms_noise` is at most `noise` or `most` are traced."""
-        found = self.render(min(samples, most), seed)
-        rounds = 0
-        while found.rms_noise > noise and found.samples < most:
-            if on_round:
-                on_round(found)
-            rounds += 1
-            # Seeds of rounds lie beyond those that other pictures are asked for.
-            more = self.render(min(found.samples, most - found.samples), seed + (rounds << 20))
-            found = found.joined(more)
-        return found
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the picture in pixels."""
+        return self._shape[0], self._shape[1]
+
+    def sample(self, pixels: npt.NDArray[np.int64], seed: int) -> Float32:
+        """Radiance [N, 3] of one path through each of `pixels` [N] (row * width + column), anywhere in the pixel."""
+        height, width = self.size
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(dr.opaque(mi.UInt32, seed), len(pixels))  # a literal would be compiled into the kernel
+        number = mi.UInt32(pixels.astype(np.uint32))
+        corner = mi.Point2f(mi.Float(number % width), mi.Float(number // width))
+        position = (corner + sampler.next_2d()) / mi.Point2f(width, height)
+        ray, weight = self._sensor.sample_ray_differential(0.0, 0.0, position, mi.Point2f(0.5))
+        radiance, _, _ = self._integrator.sample(self._scene, sampler, ray, None, True)
+        carried = weight * radiance
+        dr.eval(carried)  # now: the kernel would else hold the number of paths, and be compiled for each anew
+        out = np.asarray(carried, np.float32).T
+        if not np.isfinite(out).all():
+            raise InternalError("a path carries radiance that is not finite", where="reference")
+        return out
 
 
 def enlarged(scene: Scene, camera: Camera) -> tuple[Scene, Camera]:
