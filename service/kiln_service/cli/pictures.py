@@ -1,5 +1,6 @@
 """`lightkiln shade` and `lightkiln reference`: pictures of a package and of a scene, made by the worker's program."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -76,6 +77,12 @@ def reference(
     max_samples: Annotated[
         int, typer.Option("--max-samples", min=1, help="Paths a pixel at most, with --noise.")
     ] = 16384,
+    denoise: Annotated[
+        bool,
+        typer.Option(
+            "--denoise", help="Denoise the picture, for looking. Its file is marked and refused for measuring."
+        ),
+    ] = False,
     max_depth: Annotated[int, typer.Option("--max-depth", min=1, help="Scattering events of a path.")] = 12,
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
     white: White = None,
@@ -87,10 +94,10 @@ def reference(
     flags |= {"--noise": noise, "--max-samples": max_samples}
     flags |= {"--env": env, "--env-scale": env_scale, "--env-rotation": env_rotation, "--seed": seed}
     flags |= {"--white": white, "--device": device}
-    _run("reference", scene, flags, json)
+    _run("reference", scene, flags, json, ["--denoise"] if denoise else [])
 
 
-def _run(command: str, subject: Path, flags: dict[str, object], as_json: bool) -> None:
+def _run(command: str, subject: Path, flags: dict[str, object], as_json: bool, switches: Sequence[str] = ()) -> None:
     # One word a flag: a camera's coordinates may begin with a minus sign.
     given = [f"{flag}={value}" for flag, value in flags.items() if value is not None]
-    become("kiln_workers", [command, *given, *(["--json"] if as_json else []), "--", str(subject)])
+    become("kiln_workers", [command, *given, *switches, *(["--json"] if as_json else []), "--", str(subject)])

@@ -6,7 +6,9 @@ picture goes to a temporary file whose bytes then take the atomic way of every o
 """
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -23,8 +25,13 @@ Half = npt.NDArray[np.float16]
 REC709_CHROMATICITIES: Final = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 
-def write_rgb(path: Path, pixels: Float32 | Half, *, comments: str = "") -> None:
-    """Write linear Rec.709 pixels [H, W, 3] as an EXR, row 0 at the top; InternalError unless all are finite."""
+def write_rgb(
+    path: Path, pixels: Float32 | Half, *, comments: str = "", marks: Mapping[str, str] = MappingProxyType({})
+) -> None:
+    """Write linear Rec.709 pixels [H, W, 3] as an EXR, row 0 at the top; InternalError unless all are finite.
+
+    `marks` are further attributes of the header.
+    """
     if not np.isfinite(pixels).all():
         raise InternalError("the picture holds values that are not finite", where=path.name)
     header = {
@@ -33,6 +40,7 @@ def write_rgb(path: Path, pixels: Float32 | Half, *, comments: str = "") -> None
         "chromaticities": REC709_CHROMATICITIES,
         "software": f"lightkiln {__version__}",
         "comments": comments,
+        **marks,
     }
     channels = {"RGB": np.ascontiguousarray(pixels)}
     with tempfile.TemporaryDirectory(prefix="lightkiln-exr-") as folder:

@@ -134,6 +134,10 @@ def _register(variant: str) -> None:
                     out *= part.eval_1(si, active)
             return out
 
+        def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
+            """The base colour: what guides a denoiser, which knows no metals."""
+            return dr.select(active, self._base(si, active), 0.0)
+
         def eval_null_transmission(self, si: Any, active: Any = True) -> Any:
             if not self.passes:
                 return mi.Color3f(0.0)

@@ -32,6 +32,7 @@ def add_commands(commands: Any) -> None:
     tracing.add_argument("--noise", type=_noise, help="paths where they are needed, until the noise is at most this")
     tracing.add_argument("--max-samples", type=_positive, default=16384, help="paths a pixel at most, with --noise")
     tracing.add_argument("--max-depth", type=_positive, default=12, help="scattering events of a path")
+    tracing.add_argument("--denoise", action="store_true", help="for looking; such a picture is refused for measuring")
     tracing.add_argument("--seed", type=_natural, default=0)
     tracing.set_defaults(command=_run_reference)
 

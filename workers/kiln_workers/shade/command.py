@@ -20,6 +20,7 @@ from kiln_workers.scene.load import check_light, load_scene
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.sheets import part_sheets
 from kiln_workers.shade.adaptive import AdaptiveSampler, measured_noise
+from kiln_workers.shade.denoise import check_denoiser, denoised
 from kiln_workers.shade.gbuffer import render_gbuffer
 from kiln_workers.shade.image_files import check_output, write_picture
 from kiln_workers.shade.image_metrics import compare_pictures, flip_noise_floor, psnr
@@ -72,6 +73,8 @@ def run_shade(options: argparse.Namespace) -> int:
 def run_reference(options: argparse.Namespace) -> int:
     """Path-trace a scene, and say how noisy the picture is."""
     camera, (width, height), out = read_camera(options.camera), parse_size(options.size), check_output(options.out)
+    if options.denoise:
+        check_denoiser()
     scene = check_light(read_scene(options.scene, options.env, options.env_scale, options.env_rotation))
     began = time.perf_counter()
     tracer = ReferenceTracer(scene, camera, width, height, options.max_depth, options.device)
@@ -92,7 +95,10 @@ def run_reference(options: argparse.Namespace) -> int:
             "scout_samples": round(float(found.scouts.mean())),
         }
     white = options.white or colour.white_point(reference.picture)
-    write_picture(out, reference.picture, white)
+    picture = reference.picture
+    if options.denoise:
+        picture = denoised(picture, *tracer.guides(options.seed))
+    write_picture(out, picture, white, options.denoise)
     result = {
         "out": str(out),
         "width": width,
@@ -101,6 +107,7 @@ def run_reference(options: argparse.Namespace) -> int:
         **sampled,
         "max_depth": options.max_depth,
         "psnr_of_halves": _finite(psnr(*reference.halves, white)),
+        "denoised": options.denoise,
         "noise": measured_noise(reference, white),
         "rms_noise": reference.rms_noise,
         "flip_noise_floor": round(float(flip_noise_floor(reference.halves).mean()), 5),
@@ -178,6 +185,8 @@ def _tell(told: dict[str, Any], as_json: bool) -> None:
     for key, sentence in words.items():
         if key in told:
             print(sentence.format(told[key]))
+    if told.get("denoised"):
+        print("The picture is denoised, for looking; all figures are of the picture before that.")
     if not told.get("noise_reached", True):
         print(
             f"Noise {told['noise_asked']:g} is not reached: {told['tiles_over_noise']:.1%} of the picture has more "

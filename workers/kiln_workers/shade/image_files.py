@@ -11,6 +11,7 @@ from kiln_schemas.errors import InputError
 from kiln_workers.package import colour, exr, png
 from kiln_workers.package.files import write_bytes
 from kiln_workers.scene.model import Float32
+from kiln_workers.shade.package import DENOISED
 
 SUFFIXES: Final = (".exr", ".png")
 
@@ -28,9 +29,13 @@ def check_output(path: Path) -> Path:
     return path
 
 
-def write_picture(path: Path, radiance: Float32, white: float) -> None:
-    """Write radiance [H, W, 3]: as it is to an EXR, tone-mapped to a PNG; MachineLacks where the disk refuses."""
+def write_picture(path: Path, radiance: Float32, white: float, denoised: bool = False) -> None:
+    """Write radiance [H, W, 3]: as it is to an EXR, tone-mapped to a PNG; MachineLacks where the disk refuses.
+
+    A denoised picture is marked as such in the file's metadata; `read_exr` refuses it.
+    """
+    marks = {DENOISED: "for looking, not for measuring"} if denoised else {}
     if path.suffix.lower() == ".png":
-        write_bytes(path, png.encode(colour.tone_map(radiance, white)))
+        write_bytes(path, png.encode(colour.tone_map(radiance, white), marks))
     else:
-        exr.write_rgb(path, radiance, comments="radiance, linear Rec.709")
+        exr.write_rgb(path, radiance, comments="radiance, linear Rec.709", marks=marks)

@@ -41,6 +41,8 @@ from kiln_workers.shade import algorithm, textures
 
 Float32 = npt.NDArray[np.float32]
 
+DENOISED: Final = "lightkiln.denoised"
+"""Attribute of a picture's file that says: the picture is denoised."""
 MOST_PIXELS: Final = 2**27
 MOST_CHANNELS: Final = 16
 MOST_U_LAYERS: Final = 64
@@ -171,6 +173,7 @@ def read_exr(path: Path, most_texels: int = MOST_PIXELS) -> Float32:
             name = f"/dev/fd/{regular.fileno()}"
             with OpenEXR.File(name, header_only=True) as file:
                 _refuse_larger(file.header(), path, most_texels)
+                _refuse_denoised(file.header(), path)
             with OpenEXR.File(name) as file:
                 channels = file.channels()
                 if "RGB" not in channels:
@@ -178,6 +181,16 @@ def read_exr(path: Path, most_texels: int = MOST_PIXELS) -> Float32:
                 return np.array(channels["RGB"].pixels, dtype=np.float32)
     except (RuntimeError, OSError, ValueError) as error:
         raise InputError(f"cannot be read as OpenEXR: {error}", where=str(path)) from None
+
+
+def _refuse_denoised(header: Mapping[str, Any], path: Path) -> None:
+    """InputError where a picture is marked as denoised: whatever is read here is measured, or measured against."""
+    if DENOISED in header:
+        raise InputError(
+            "is a denoised picture, which is for looking only: the denoiser's errors would be measured as light",
+            where=str(path),
+            remedy="Path-trace it again without --denoise.",
+        )
 
 
 def _refuse_larger(header: Mapping[str, Any], path: Path, most_texels: int) -> None:

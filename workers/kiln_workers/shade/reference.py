@@ -23,6 +23,9 @@ from kiln_workers.scene.origin import Point, local_camera
 SAMPLES_A_PASS: Final = 1 << 24
 """Paths of one wavefront: bounds the memory."""
 
+GUIDE_RAYS: Final = 16
+"""Rays a pixel of what a denoiser is guided by."""
+
 LEAST_DIAGONAL: Final = 64.0
 """Metres; Mitsuba keeps 1e-4 (1 + the coordinate) off surfaces, which is little from here on."""
 
@@ -108,13 +111,9 @@ class ReferenceTracer:
 
     def sample(self, pixels: npt.NDArray[np.int64], seed: int) -> Float32:
         """Radiance [N, 3] of one path through each of `pixels` [N] (row * width + column), anywhere in the pixel."""
-        height, width = self.size
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, seed), len(pixels))  # a literal would be compiled into the kernel
-        number = mi.UInt32(pixels.astype(np.uint32))
-        corner = mi.Point2f(mi.Float(number % width), mi.Float(number // width))
-        position = (corner + sampler.next_2d()) / mi.Point2f(width, height)
-        ray, weight = self._sensor.sample_ray_differential(0.0, 0.0, position, mi.Point2f(0.5))
+        ray, weight = self._ray(pixels, sampler)
         radiance, _, _ = self._integrator.sample(self._scene, sampler, ray, None, True)
         carried = weight * radiance
         dr.eval(carried)  # now: the kernel would else hold the number of paths, and be compiled for each anew
@@ -122,6 +121,30 @@ class ReferenceTracer:
         if not np.isfinite(out).all():
             raise InternalError("a path carries radiance that is not finite", where="reference")
         return out
+
+    def guides(self, seed: int = 0) -> tuple[Float32, Float32]:
+        """Base colour and normal [H, W, 3] of what each pixel sees first, means of `GUIDE_RAYS` rays; 0 beside it."""
+        height, width = self.size
+        pixels = np.repeat(np.arange(height * width), GUIDE_RAYS)
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed, len(pixels))
+        ray, _ = self._ray(pixels, sampler)
+        si = self._scene.ray_intersect(ray)
+        albedo = dr.select(si.is_valid(), si.bsdf().eval_diffuse_reflectance(si, si.is_valid()), 0.0)
+        normal = dr.select(si.is_valid(), mi.Vector3f(si.sh_frame.n), 0.0)
+        dr.eval(albedo, normal)
+        shape = (height, width, GUIDE_RAYS, 3)
+        base, normals = (np.asarray(values, np.float32).T.reshape(shape).mean(axis=2) for values in (albedo, normal))
+        return base, normals
+
+    def _ray(self, pixels: npt.NDArray[np.int64], sampler: Any) -> tuple[Any, Any]:
+        """Rays through random places of pixels [N], and their weights."""
+        height, width = self.size
+        number = mi.UInt32(pixels.astype(np.uint32))
+        corner = mi.Point2f(mi.Float(number % width), mi.Float(number // width))
+        position = (corner + sampler.next_2d()) / mi.Point2f(width, height)
+        ray, weight = self._sensor.sample_ray_differential(0.0, 0.0, position, mi.Point2f(0.5))
+        return ray, weight
 
 
 def enlarged(scene: Scene, camera: Camera) -> tuple[Scene, Camera]:
