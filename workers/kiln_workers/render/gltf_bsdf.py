@@ -15,6 +15,8 @@ it out, and all other values are already times the opacity.
 A normal map turns the frame that all of this is meant in (`scene.normal_maps`), bent towards i where it would face
 away; light that would leave on the other side of the unmapped surface is lost. What passes straight through does not
 depend on the map.
+An emitter's mesh is flat to Mitsuba (`mitsuba_scene`): its interpolated normals are an attribute of its vertices and
+turn the frame in the same way.
 Letters: i incident (`si.wi`, to the eye), o scattered (`wo`), h half-way; all in the frame of the shading normal.
 """
 
@@ -52,7 +54,7 @@ class _Point:
     alpha: Any  # Float: GGX
     chance: Any  # Float: of the glossy lobe
     opacity: Any  # Float: 1 where the surface is whole
-    frame: Any  # Frame3f of the normal map in the shading frame, on the side of i; None without a map
+    frame: Any  # Frame3f of the normal map or an emitter's normal in the shading frame, on the side of i; None without
     side: Any  # Float: -1 where the back of a double-sided surface is meant
 
 
@@ -63,7 +65,7 @@ def _register(variant: str) -> None:
 
         `base_color`, `roughness` (perceptual, above 0), `metallic`, and where given `opacity` and `transmission` are
         textures; `tint` (the vertices' colour) multiplies the base colour, `tint_alpha` the opacity. A `normal_map`
-        needs the mesh's attributes `vertex_tangent` and `vertex_hand`.
+        needs the mesh's attributes `vertex_tangent` and `vertex_hand`, `rounded` needs `vertex_rounded`.
         """
 
         def __init__(self, properties: Any) -> None:
@@ -76,6 +78,7 @@ def _register(variant: str) -> None:
             self.normal_scale = float(properties.get("normal_scale", 1.0))
             self.f90 = float(properties.get("f90", 1.0))
             self.double_sided = bool(properties.get("double_sided", False))
+            self.rounded = bool(properties.get("rounded", False))
             sides = mi.BSDFFlags.FrontSide
             if self.double_sided:
                 sides = sides | mi.BSDFFlags.BackSide
@@ -106,22 +109,33 @@ def _register(variant: str) -> None:
             return _Point(albedo, f0, f90, (dr.max(self.f0), self.f90), alpha, chance, opacity, frame, side)
 
         def _frame(self, si: Any, active: Any) -> tuple[Any, Any]:
-            """The normal map's frame on the side of `si.wi`, None without a map; and the sign of that side."""
+            """The frame of map and rounding on the side of `si.wi`, None without both; and the sign of that side."""
             side = mi.Float(1.0)
             if self.double_sided:
                 side = dr.select(si.wi.z < 0.0, mi.Float(-1.0), mi.Float(1.0))
-            if self.normal_map is None:
+            if self.normal_map is None and not self.rounded:
                 return None, side
+            n = self._normal(si, active)
+            mapped = side * (n if self.normal_map is None else self._mapped(si, n, active))
+            missing = dr.maximum(LEAST_FACING - dr.dot(mapped, si.wi), 0.0)
+            return mi.Frame3f(dr.normalize(mapped + missing * si.wi)), side
+
+        def _normal(self, si: Any, active: Any) -> Any:
+            """The interpolated normal in the shading frame, on the front."""
+            if not self.rounded:
+                return mi.Vector3f(0.0, 0.0, 1.0)
+            return dr.normalize(si.to_local(mi.Vector3f(si.shape.eval_attribute_3("vertex_rounded", si, active))))
+
+        def _mapped(self, si: Any, n: Any, active: Any) -> Any:
+            """The normal map's normal about the interpolated one, `n`."""
             texel = self.normal_map.eval_3(si, active)
             m = 2.0 * mi.Vector3f(texel.x, texel.y, texel.z) - 1.0
             along = si.to_local(mi.Vector3f(si.shape.eval_attribute_3("vertex_tangent", si, active)))
-            along.z = 0.0
+            along -= dr.dot(along, n) * n
             along *= dr.rsqrt(dr.maximum(dr.squared_norm(along), 1e-12))
-            up = si.shape.eval_attribute_1("vertex_hand", si, active) * mi.Vector3f(-along.y, along.x, 0.0)
+            up = si.shape.eval_attribute_1("vertex_hand", si, active) * dr.cross(n, along)
             scaled = self.normal_scale * (m.x * along + m.y * up)
-            mapped = side * dr.normalize(mi.Vector3f(scaled.x, scaled.y, dr.maximum(m.z, LEAST_HEIGHT)))
-            missing = dr.maximum(LEAST_FACING - dr.dot(mapped, si.wi), 0.0)
-            return mi.Frame3f(dr.normalize(mapped + missing * si.wi)), side
+            return dr.normalize(scaled + dr.maximum(m.z, LEAST_HEIGHT) * n)
 
         def _base(self, si: Any, active: Any) -> Any:
             base = self.base_color.eval(si, active)
@@ -145,7 +159,8 @@ def _register(variant: str) -> None:
             through = mi.Color3f(1.0 - opacity)
             if self.transmission is not None:
                 kept = (1.0 - self.metallic.eval_1(si, active)) * self.transmission.eval_1(si, active)
-                reflected = _schlick(dr.max(self.f0), self.f90, dr.abs(mi.Frame3f.cos_theta(si.wi)))
+                cosine = dr.dot(self._normal(si, active), si.wi) if self.rounded else mi.Frame3f.cos_theta(si.wi)
+                reflected = _schlick(dr.max(self.f0), self.f90, dr.abs(cosine))
                 through += self._base(si, active) * (opacity * kept * (1.0 - reflected))
             return dr.select(active, through, 0.0)
 

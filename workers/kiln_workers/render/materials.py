@@ -21,7 +21,11 @@ MIN_ROUGHNESS: Final = 0.05
 """Below this the GGX peak outgrows float32 and no sampler finds it; alpha 0.0025 is a mirror at any image size here."""
 
 
-def vertex_attributes(mesh: Mesh) -> dict[str, Float32]:
+ROUND: Final = 0.9999
+"""Cosine between a vertex's normal and its face's from which on the two are the same: 0.8 degrees."""
+
+
+def vertex_attributes(mesh: Mesh, material: Material) -> dict[str, Float32]:
     """What a mesh carries beside Mitsuba's own attributes: values [V, 1 or 3] by name."""
     out: dict[str, Float32] = {}
     for number, uv in enumerate(mesh.more_uv, start=1):
@@ -30,7 +34,20 @@ def vertex_attributes(mesh: Mesh) -> dict[str, Float32]:
         out["vertex_tint"], out["vertex_alpha"] = mesh.colors[:, :3], mesh.colors[:, 3:]
     if mesh.tangents is not None:
         out["vertex_tangent"], out["vertex_hand"] = mesh.tangents[:, :3], mesh.tangents[:, 3:]
+    if rounded_emitter(mesh, material):
+        out["vertex_rounded"] = mesh.normals
     return out
+
+
+def rounded_emitter(mesh: Mesh, material: Material) -> bool:
+    """Whether a mesh glows and its normals are not those of its faces: such a surface is told them as an attribute."""
+    if max(material.emission) <= 0.0:
+        return False
+    corners = mesh.positions[mesh.faces].astype(np.float64)  # [F, 3, 3]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    off = np.einsum("fcd,fd->fc", mesh.normals[mesh.faces].astype(np.float64), normal) < ROUND * length
+    return bool((off & (length > 0.0)).any())
 
 
 def _uv_name(number: int) -> str:
@@ -57,6 +74,7 @@ class MaterialBuilder:
             len(mesh.uv_sets),
             int(mesh.colors is not None),
             int(mesh.tangents is not None),
+            int(rounded_emitter(mesh, material)),
         )
         if any(reference.wrap[0] != reference.wrap[1] for reference in material.textures):
             key = (*key, id(mesh))  # its textures are unrolled over this mesh's coordinates
@@ -97,6 +115,8 @@ class MaterialBuilder:
         surface |= self._reflectance(material, mesh)
         if material.double_sided:
             surface["double_sided"] = True
+        if rounded_emitter(mesh, material):
+            surface["rounded"] = True
         if mesh.colors is not None:
             surface["tint"] = mi.load_dict({"type": "mesh_attribute", "name": "vertex_tint"})
         if material.lets_light_pass:

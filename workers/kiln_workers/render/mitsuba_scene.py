@@ -16,7 +16,7 @@ from kiln_workers.render.jit import dr, mi
 from kiln_workers.render.materials import MaterialBuilder, vertex_attributes
 from kiln_workers.scene.environment import MITSUBA_TURN
 from kiln_workers.scene.geometry import Floats
-from kiln_workers.scene.model import Environment, Float32, LightKind, Mesh, PunctualLight, Scene
+from kiln_workers.scene.model import Environment, Float32, LightKind, Material, Mesh, PunctualLight, Scene
 from kiln_workers.scene.precision import face_clearance
 
 SHEET_GAP: Final = 2.0
@@ -35,10 +35,10 @@ def to_mitsuba(scene: Scene) -> Any:
             continue
         material = scene.materials[mesh.material]
         bsdf, weight = materials.bsdf(mesh), powers.mesh_weight(mesh)
-        parts[f"mesh_{number}"] = _mesh(mesh, bsdf, materials.emitter(mesh, weight))
+        parts[f"mesh_{number}"] = _mesh(mesh, material, bsdf, materials.emitter(mesh, weight))
         if max(material.emission) > 0.0 and material.double_sided:
             back = back_sheet(mesh, SHEET_GAP * face_clearance(mesh.positions, mesh.faces))
-            parts[f"mesh_{number}_back"] = _mesh(back, bsdf, materials.emitter(back, weight))
+            parts[f"mesh_{number}_back"] = _mesh(back, material, bsdf, materials.emitter(back, weight))
     for number, light in enumerate(scene.lights):
         parts[f"light_{number}"] = _light(light, powers.light_weight(light))
     if scene.environment is not None:
@@ -78,7 +78,7 @@ def back_sheet(mesh: Mesh, gap: Floats) -> Mesh:
         turned,
         name=f"{mesh.name} (back)",
         positions=(corners - (gap[:, None] * normal)[:, None])[:, ::-1].reshape(-1, 3).astype(np.float32),
-        normals=-np.repeat(normal, 3, axis=0).astype(np.float32),
+        normals=-turned.normals,
         # So that mapped normals are the front's, turned over.
         tangents=None if turned.tangents is None else -turned.tangents,
     )
@@ -134,12 +134,13 @@ class _EmitterPowers:
         return environment.scale * mean * np.pi * 4.0 * np.pi * self.radius**2
 
 
-def _mesh(mesh: Mesh, bsdf: Any, emitter: Any | None) -> Any:
+def _mesh(mesh: Mesh, material: Material, bsdf: Any, emitter: Any | None) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     if emitter is not None:
         properties["emitter"] = emitter
     # Emitters are flat: Mitsuba converts areas to solid angles with the interpolated normal, which would be biased.
+    # Their surfaces get these normals as an attribute (`rounded_emitter`).
     smooth = emitter is None
     out = mi.Mesh(
         mesh.name, len(mesh.positions), len(mesh.faces), properties, smooth, has_vertex_texcoords=mesh.uv is not None
@@ -152,7 +153,7 @@ def _mesh(mesh: Mesh, bsdf: Any, emitter: Any | None) -> Any:
     if mesh.uv is not None:
         parameters["vertex_texcoords"] = mi.Float(np.ravel(mesh.uv).astype(np.float32))
     parameters.update()
-    for name, values in vertex_attributes(mesh).items():
+    for name, values in vertex_attributes(mesh, material).items():
         out.add_attribute(name, values.shape[1], np.ravel(values).astype(np.float32))
     dr.eval(parameters["vertex_positions"])
     return out
