@@ -35,6 +35,14 @@ class ReferenceView(Contract):
     camera: Camera
     white: float = Field(gt=0.0, le=FLOAT32_MAX)
     """Luminance that it shows as white."""
+    flip: float | None = Field(default=None, ge=0.0, le=1.0)
+    """Mean HDR-FLIP of the package's picture against it."""
+    noise_floor: float | None = Field(default=None, ge=0.0, le=1.0)
+    """What a package without any error would measure, for the noise of the path-traced picture."""
+    samples: Count | None = None
+    """Paths a pixel of the path-traced picture."""
+    width: Count | None = None
+    height: Count | None = None
 
 
 Figures = Annotated[dict[Name, Any], Field(max_length=64)]
@@ -61,7 +69,7 @@ class Manifest(Contract):
     gates: tuple[GateResult, ...] = Field(default=(), max_length=MOST_CAMERAS + 2)
     """The quality gates that the job stated, measured."""
     views: dict[CameraName, ReferenceView] = Field(default_factory=dict, max_length=MOST_CAMERAS)
-    """Of `gates/NAME_reference.png`, by NAME."""
+    """Of `gates/NAME_reference.png`, by NAME: those of FLIP gates, else the one of `package.pictures`."""
     left_out: dict[Name, Told] = Field(default_factory=dict, max_length=64)
     """Artifact or function to the reason why it is absent."""
     textures: dict[Name, Figures] = Field(max_length=64)

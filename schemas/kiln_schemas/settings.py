@@ -169,6 +169,9 @@ class PackageSettings(Contract):
         description="side of the GGX cube's largest mip",
     )
     supercompress: bool = Field(default=True, description="Zstandard inside the lobe textures")
+    pictures: bool = Field(
+        default=True, description="compare a picture of the package with a path-traced one where no gate does"
+    )
 
 
 class BakeSettings(Contract):

@@ -212,13 +212,33 @@ def test_the_grade_of_a_coarse_light_map(specks: float, word: str) -> None:
     ],
 )
 def test_the_verdict_on_pictures_is_what_noise_does_not_explain(flip: float, noise: float, word: str) -> None:
-    better = GateResult.of("flip.other", flip, 0.2, noise_floor=flip)
-    lobes = GateResult.of("log_mse_rel", 0.9, 0.2)
-    found = report.verdict([better, GateResult.of("flip.front", flip, 0.2, noise_floor=noise), lobes])
+    camera = Camera(position=(0, 1, 3), target=(0, 0, 0), fov_deg=45)
+    seen = ReferenceView(camera=camera, white=1.0, flip=flip, noise_floor=noise)
+    better = ReferenceView(camera=camera, white=1.0, flip=flip, noise_floor=flip)
+    found = report.verdict({"other": better, "front": seen, "old": ReferenceView(camera=camera, white=1.0)})
     assert found is not None and (found["word"], found["camera"]) == (word, "front")
 
 
+def test_pictures_that_no_gate_asked_for_are_judged_and_shown(make_sample, tmp_path: Path) -> None:
+    picture = np.full((9, 16, 3), 90, np.uint8)
+    camera = Camera(position=(0, 1, 3), target=(0, 0, 0), fov_deg=45)
+    seen = ReferenceView(camera=camera, white=2.0, flip=0.15, noise_floor=0.05, samples=128, width=16, height=9)
+    judgement = Judgement((), (View("first", seen, picture, picture),))
+    artifacts = build_package(tmp_path, make_sample().given, lambda folder, manifest: judgement)
+    names = {item.name for item in artifacts}
+    assert {"gates/first.png", "gates/first_reference.png"} <= names and "gates.xml" not in names
+    assert Manifest.model_validate_json((tmp_path / "manifest.json").read_bytes()).views == {"first": seen}
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    words = " ".join(" ".join(page.text).split())
+    assert "Pictures: visibly different from the reference 0.150 FLIP" in words
+    assert "makes 0.0500 of it (16 × 9 pixels, 128 paths each)" in words
+    assert "Quality gates" not in words and "first: the reference, path-traced" in words
+
+
 def test_without_a_picture_nothing_is_said_of_the_look(make_sample, tmp_path: Path) -> None:
-    text, _ = built(tmp_path, make_sample())
-    assert report.verdict([GateResult.of("log_mse_rel", 0.01, 0.2)]) is None
+    judgement = Judgement(not_compared="the device <gone>")
+    build_package(tmp_path, make_sample().given, lambda folder, manifest: judgement)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert report.verdict({}) is None
+    assert "was not judged: the device &lt;gone&gt;." in text
     assert "Pictures: not compared" in text and "fit of the lobes: " in text

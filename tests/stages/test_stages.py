@@ -27,11 +27,13 @@ from kiln_workers.fit.metrics import TexelErrors, texel_errors
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.package import ktx2
 from kiln_workers.package.exr import write_rgb
+from kiln_workers.package.gates import Judgement
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.package.half import layers_to_lobes
 from kiln_workers.scene.archive import unpack_scene
 from kiln_workers.scene.model import Environment
 from kiln_workers.scene.texel_map import TexelState, unpack_texel_map
+from kiln_workers.shade.first_camera import first_camera
 from kiln_workers.shade.gbuffer import render_gbuffer
 from kiln_workers.shade.image_metrics import flip
 from kiln_workers.shade.package import ShadePackage, read_manifest
@@ -246,7 +248,8 @@ def test_a_package_without_its_irradiance_misses_the_gate(
         cameras={"front": FRONT},
     )
     told: list[str] = []
-    judge = gates.GateJudge(payload, unpack_scene(baked.context.blob(baked.prepared.scene)), {}, told.append)
+    scene = unpack_scene(baked.context.blob(baked.prepared.scene))
+    judge = gates.GateJudge(payload, scene, {}, told.append, baked.context.blob)
     values = {}
     for folder in (downloaded, tmp_path / "dark"):
         (result,) = judge(folder, read_manifest(folder)).results
@@ -254,3 +257,45 @@ def test_a_package_without_its_irradiance_misses_the_gate(
         assert result.flip_of_halves is not None and result.flip_of_halves <= 0.15, "half of the threshold"
     assert values["dark"] > 0.3 > values[downloaded.name]
     assert told[0] == "shading from camera front" and told[1] == "path-tracing from camera front"
+
+
+def test_without_a_gate_one_picture_is_compared(baked: Baked, downloaded: Path, tmp_path: Path) -> None:
+    """From where the viewer looks first; what is wrong in a file is noticed, and who does not want it has none."""
+    scene = unpack_scene(baked.context.blob(baked.prepared.scene))
+
+    def judged(folder: Path, *overrides: str, cameras: dict[str, Camera] | None = None) -> Judgement:
+        payload = PackagePayload(
+            job_id="j",
+            job_name="room",
+            bundle=baked.prepare_payload.bundle,
+            prepare=baked.prepared,
+            renders=(),
+            fits=(),
+            settings=make_settings("draft", [*TINY, "package.pictures=on", *overrides]),
+            store_url="",
+            cameras=cameras or {},
+        )
+        judge = gates.GateJudge(payload, scene, {}, lambda message: None, baked.context.blob)
+        return judge(folder, read_manifest(folder))
+
+    found = judged(downloaded)
+    assert found.results == () and [view.camera for view in found.views] == ["first"]
+    seen = found.views[0].seen
+    assert (seen.width, seen.height, seen.samples) == (192, 108, 64)
+    assert seen.camera == first_camera(scene, 192 / 108)
+    package = ShadePackage.read(downloaded, torch.device("cpu"))
+    picture = shade(package, render_gbuffer(package.scene, seen.camera, 192, 108))
+    reference = path_trace(scene, seen.camera, 192, 108, 64, 12)
+    assert seen.flip == pytest.approx(flip(reference.picture, picture), rel=1e-3)
+    assert seen.noise_floor is not None and 0.0 < seen.noise_floor < 0.2
+
+    shutil.copytree(downloaded, tmp_path / "dark")
+    write_rgb(tmp_path / "dark" / "irradiance.exr", np.zeros((16, 16, 3), np.float32))
+    dark = judged(tmp_path / "dark").views[0].seen
+    assert dark.flip is not None and seen.flip is not None and dark.flip > seen.flip + 0.1
+    assert dark.noise_floor == seen.noise_floor
+
+    named = judged(downloaded, cameras={"front": FRONT}).views
+    assert [(view.camera, view.seen.camera) for view in named] == [("front", FRONT)]
+    off = judged(downloaded, "package.pictures=off")
+    assert off.views == () and off.not_compared == "package.pictures is off"

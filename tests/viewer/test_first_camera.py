@@ -15,6 +15,7 @@ from packages import SCREENSHOTS
 from kiln_schemas import conventions
 from kiln_schemas.manifest import Manifest, ReferenceView
 from kiln_workers.scene.model import Scene
+from kiln_workers.shade.first_camera import first_camera
 
 WIDTH, HEIGHT = 64, 36
 
@@ -107,3 +108,31 @@ def test_a_stated_camera_goes_first_and_a_very_large_scene_is_not_searched(serve
             }"""
         )
     assert camera["position"][1] > 1.0 and camera["position"][2] > camera["position"][0] > 0.0
+
+
+@pytest.mark.parametrize("name", ["room", "courtyard", "gallery", "block"])
+def test_a_bake_looks_from_where_the_viewer_does(name, serve, viewer, tmp_path) -> None:
+    """The rule is written twice, for the browser and for the picture of a bake's report."""
+    scenes = {"room": packages.room_scene, "courtyard": packages.courtyard, "block": packages.block_scene}
+    scene = scenes.get(name, packages.SCENES["gallery"])()
+    folder = packages.write_package(tmp_path / name, scene, size=32, lobes=2)
+    with serve(folder) as url:
+        page = viewer.open(url)
+        page.evaluate("viewer.then(() => 0)")
+        aspect, eye, target, fov = page.evaluate(
+            """viewer.then(({ camera, target }) => {
+                const canvas = document.querySelector("canvas");
+                const aspect = canvas.clientWidth / Math.max(canvas.clientHeight, 1);
+                return [aspect, camera.position.toArray(), target.toArray(), camera.fov];
+            })"""
+        )
+    ours = first_camera(scene, aspect)
+    assert ours.fov_deg == pytest.approx(fov)
+    if name in ("room", "courtyard"):
+        # From inside, several views are worth the same by symmetry; rounding chooses.
+        corners = np.concatenate([mesh.positions for mesh in scene.meshes])
+        assert (np.array(ours.position) > corners.min(axis=0)).all() and (ours.position < corners.max(axis=0)).all()
+        assert ours.position[1] == pytest.approx(eye[1], abs=1e-3)
+        return
+    np.testing.assert_allclose(ours.position, eye, atol=1e-3)
+    np.testing.assert_allclose(ours.target, target, atol=1e-3)

@@ -184,8 +184,9 @@ def build_package(folder: Path, given: PackageInput, judge: Judge | None = None)
         package.add(name)
 
     # The report shows the manifest as it stands without the report; the final manifest then names the report as well.
-    views = package.judgement.views
-    shown = report.ReportInput(_manifest(package), given.payload.fits, given.preview, irradiance, valid, views)
+    shown = report.ReportInput(
+        _manifest(package), given.payload.fits, given.preview, irradiance, valid, package.judgement
+    )
     write_bytes(folder / REPORT_HTML, report.render(shown))
     package.add(REPORT_HTML)
     manifest = _manifest(package).model_dump_json(indent=2) + "\n"

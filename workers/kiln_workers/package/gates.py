@@ -28,18 +28,20 @@ class View:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The gates as measured; nothing where a job states none."""
+    """The gates as measured, none where a job states none, and the pictures that were compared."""
 
     results: tuple[GateResult, ...] = ()
     views: tuple[View, ...] = ()
+    not_compared: str = ""
+    """Why there are no pictures."""
 
 
 def write_gates(folder: Path, job_name: str, judgement: Judgement) -> list[str]:
-    """Write what the gates came to into a package's folder; the names of the files."""
-    if not judgement.results:
-        return []
-    write_bytes(folder / GATES_XML, junit(job_name, judgement.results))
-    names = [GATES_XML]
+    """Write what the gates came to, and the pictures, into a package's folder; the names of the files."""
+    names = []
+    if judgement.results:
+        write_bytes(folder / GATES_XML, junit(job_name, judgement.results))
+        names.append(GATES_XML)
     for view in judgement.views:
         for suffix, picture in (("", view.picture), (REFERENCE_SUFFIX, view.reference)):
             names.append(f"{GATES_FOLDER}/{view.camera}{suffix}.png")

@@ -5,7 +5,7 @@ follows the reader's light or dark scheme. Names in it come from users and are e
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any, Final
 
@@ -13,12 +13,11 @@ import jinja2
 import numpy as np
 import numpy.typing as npt
 
-from kiln_schemas.gates import FLIP, GateResult
-from kiln_schemas.manifest import Manifest
+from kiln_schemas.manifest import Manifest, ReferenceView
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Artifact, FitMetrics, FitResult
 from kiln_workers.package import charts, colour
-from kiln_workers.package.gates import View
+from kiln_workers.package.gates import Judgement
 from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelPreview
 from kiln_workers.scene.texel_map import COARSE
 from kiln_workers.sphere import octahedral
@@ -58,8 +57,7 @@ class ReportInput:
     preview: PackagePreview
     irradiance: Float32  # [H, W, 3], dilated
     covered: npt.NDArray[np.bool_]  # [H, W]
-    views: Sequence[View] = ()
-    """The pictures that quality gates compared."""
+    judgement: Judgement = field(default_factory=Judgement)
 
 
 def render(report: ReportInput) -> bytes:
@@ -80,10 +78,16 @@ def render(report: ReportInput) -> bytes:
         manifest=manifest,
         settings=_flat(manifest.settings.model_dump(mode="json")),
         functions=functions,
-        verdict=verdict(manifest.gates),
+        verdict=verdict(manifest.views),
+        not_compared=report.judgement.not_compared,
         views=[
-            {"camera": v.camera, "picture": charts.data_uri(v.picture), "reference": charts.data_uri(v.reference)}
-            for v in report.views
+            {
+                "camera": v.camera,
+                "seen": v.seen,
+                "picture": charts.data_uri(v.picture),
+                "reference": charts.data_uri(v.reference),
+            }
+            for v in report.judgement.views
         ],
         stages=_stages(manifest.stage_seconds),
         atlas=charts.data_uri(report.preview.atlas),
@@ -94,16 +98,14 @@ def render(report: ReportInput) -> bytes:
     return html.encode("utf-8")
 
 
-def verdict(gates: Sequence[GateResult]) -> dict[str, Any] | None:
-    """What the pictures of FLIP gates say of the bake, by the worst of them; None where none was compared."""
-    pictures = [gate for gate in gates if gate.name.startswith(FLIP)]
-    if not pictures:
+def verdict(views: Mapping[str, ReferenceView]) -> dict[str, Any] | None:
+    """What the pictures say of the bake, by the worst of them; None where none was compared."""
+    excess = {camera: seen.flip - (seen.noise_floor or 0.0) for camera, seen in views.items() if seen.flip is not None}
+    if not excess:
         return None
-    worst = max(pictures, key=lambda gate: gate.value - (gate.noise_floor or 0.0))
-    excess = worst.value - (worst.noise_floor or 0.0)
-    word, style = _word_of(excess, _PICTURE_GRADES, "plainly different from the reference")
-    camera = worst.name.removeprefix(FLIP)
-    return {"word": word, "style": style, "camera": camera, "flip": worst.value, "noise": worst.noise_floor}
+    camera = max(excess, key=lambda name: excess[name])
+    word, style = _word_of(excess[camera], _PICTURE_GRADES, "plainly different from the reference")
+    return {"word": word, "style": style, "camera": camera, "seen": views[camera], "of_several": len(excess) > 1}
 
 
 def grade(log_mse_rel: float, speck_share: float = 0.0) -> tuple[str, str]:

@@ -56,7 +56,7 @@ def read_gltf(folder: Path, entry: str) -> Scene:
 
 
 @dataclass
-class _Placed:
+class Placed:
     """A node with its transform to the world."""
 
     index: int
@@ -81,6 +81,39 @@ class _Draco:
     faces: Ints  # [F, 3]
 
 
+def placed_nodes(document: Document, entry: str) -> list[Placed]:
+    """Nodes of the scene, depth first, each with its world transform; a node reached twice is refused."""
+    if document.scenes:
+        roots = pick(document.scenes, document.scene or 0, "scene", entry).nodes
+    else:
+        children = {child for node in document.nodes for child in node.children}
+        roots = [index for index in range(len(document.nodes)) if index not in children]
+    seen: set[int] = set()
+    out: list[Placed] = []
+    stack = [(index, np.eye(4), True) for index in reversed(roots)]
+    while stack:
+        index, parent, visible = stack.pop()
+        if index in seen:
+            raise InputError(
+                f"node {index} is reached twice: a cycle, or two parents",
+                where=entry,
+                remedy="Export it again.",
+            )
+        seen.add(index)
+        node = pick(document.nodes, index, "node", entry)
+        with np.errstate(over="ignore", invalid="ignore"):
+            matrix = parent @ _local_matrix(node)
+        if not np.isfinite(matrix).all():
+            raise InputError(
+                f"the transform of node {index} '{node.name}' is not finite", where=entry, remedy="Mend it."
+            )
+        content = node.extensions.get("KHR_node_visibility", {})
+        visible &= parse_extension(Visibility, content, f"{entry}: KHR_node_visibility").visible
+        out.append(Placed(index, node, matrix, visible))
+        stack += [(child, matrix, visible) for child in reversed(node.children)]
+    return out
+
+
 @dataclass
 class _Reader:
     document: Document
@@ -88,13 +121,13 @@ class _Reader:
     entry: str
     notes: list[str] = field(default_factory=list)
     ignored: Counter[str] = field(default_factory=Counter)
-    hidden: int = 0
 
     def read(self) -> Scene:
         document = self.document
         self.notes += check_extensions(document.extensions_used, document.extensions_required, self.entry)
         materials = MaterialTable(self.document, self.buffers, self.notes)
-        placed = self._placed_nodes()
+        placed = placed_nodes(document, self.entry)
+        hidden = sum(not item.visible for item in placed)
         meshes: list[Mesh] = []
         for raw, matrix in self._instances(placed, materials):
             mesh, notes = place(raw, matrix)
@@ -103,8 +136,8 @@ class _Reader:
         self.notes += [f"'{self.entry}': {what} ({count}) ignored." for what, count in sorted(self.ignored.items())]
         if self.document.animations:
             self.notes.append(f"'{self.entry}': animations ignored; the scene is baked in its rest pose.")
-        if self.hidden:
-            self.notes.append(f"'{self.entry}': {self.hidden} hidden nodes left out.")
+        if hidden:
+            self.notes.append(f"'{self.entry}': {hidden} hidden nodes left out.")
         return Scene(
             meshes=tuple(meshes),
             materials=tuple(materials.materials),
@@ -113,41 +146,7 @@ class _Reader:
             notes=tuple(self.notes),
         )
 
-    def _placed_nodes(self) -> list[_Placed]:
-        """Nodes of the scene, depth first, each with its world transform; a node reached twice is refused."""
-        document = self.document
-        if document.scenes:
-            roots = pick(document.scenes, document.scene or 0, "scene", self.entry).nodes
-        else:
-            children = {child for node in document.nodes for child in node.children}
-            roots = [index for index in range(len(document.nodes)) if index not in children]
-        seen: set[int] = set()
-        out: list[_Placed] = []
-        stack = [(index, np.eye(4), True) for index in reversed(roots)]
-        while stack:
-            index, parent, visible = stack.pop()
-            if index in seen:
-                raise InputError(
-                    f"node {index} is reached twice: a cycle, or two parents",
-                    where=self.entry,
-                    remedy="Export it again.",
-                )
-            seen.add(index)
-            node = pick(document.nodes, index, "node", self.entry)
-            with np.errstate(over="ignore", invalid="ignore"):
-                matrix = parent @ _local_matrix(node)
-            if not np.isfinite(matrix).all():
-                raise InputError(
-                    f"the transform of node {index} '{node.name}' is not finite", where=self.entry, remedy="Mend it."
-                )
-            content = node.extensions.get("KHR_node_visibility", {})
-            visible &= parse_extension(Visibility, content, f"{self.entry}: KHR_node_visibility").visible
-            self.hidden += not visible
-            out.append(_Placed(index, node, matrix, visible))
-            stack += [(child, matrix, visible) for child in reversed(node.children)]
-        return out
-
-    def _instances(self, placed: list[_Placed], materials: MaterialTable) -> list[tuple[RawMesh, Floats]]:
+    def _instances(self, placed: list[Placed], materials: MaterialTable) -> list[tuple[RawMesh, Floats]]:
         """Every primitive of every instance with its transform; triangles are counted before anything is copied."""
         primitives: dict[tuple[int, tuple[float, ...]], list[_Part]] = {}
         worlds = {item.index: item.matrix for item in placed}
@@ -178,7 +177,7 @@ class _Reader:
         names = unique_names(raw.name for raw, _ in pairs)
         return [(replace(raw, name=name), matrix) for name, (raw, matrix) in zip(names, pairs, strict=True)]
 
-    def _instance_matrices(self, item: _Placed, before: int) -> list[Floats]:
+    def _instance_matrices(self, item: Placed, before: int) -> list[Floats]:
         """World transforms of a node's instances; `before` are there already."""
         content = item.node.extensions.get("EXT_mesh_gpu_instancing")
         if content is None:
@@ -315,7 +314,7 @@ class _Reader:
             )
         return values
 
-    def _lights(self, placed: list[_Placed]) -> list[PunctualLight]:
+    def _lights(self, placed: list[Placed]) -> list[PunctualLight]:
         where = f"{self.entry}: KHR_lights_punctual"
         table = parse_extension(Lights, self.document.extensions.get("KHR_lights_punctual", {}), where).lights
         out = []

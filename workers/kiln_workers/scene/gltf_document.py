@@ -125,6 +125,7 @@ class Node(_Part):
     name: Name = ""
     children: Table[Index] = []
     mesh: Index | None = None
+    camera: Any = None
     skin: Index | None = None
     weights: Table[float] = []
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
@@ -284,6 +285,7 @@ class Document(_Part):
     samplers: Table[Sampler] = []
     skins: Table[Skin] = []
     animations: Table[Any] = []
+    cameras: Table[Any] = []
     extensions_used: Table[str] = []
     extensions_required: Table[str] = []
     extensions: Extensions = {}

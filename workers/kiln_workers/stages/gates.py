@@ -1,10 +1,14 @@
-"""Measure the quality gates that a job states (`kiln_schemas.gates`), on a package's files as they will be downloaded.
+"""Measure the quality gates that a job states, and how the package looks, on its files as they will be downloaded.
 
-The errors of the lobes are known when the files are written. For a FLIP gate the package is shaded from the gate's
-camera (`shade.picture`) and held against a path-traced reference of the scene. The reference has noise, and noise looks
-like an error: rounds of paths are added until its two halves differ, in FLIP, by no more than a part of the threshold,
-or a bound is reached; what they still differ by is stated with the result. The package has no part in that choice, so
-the same scene, camera and threshold have the same reference, whatever was baked.
+The errors of the lobes are known when the files are written. For a picture the package is shaded (`shade.picture`) and
+held against a path-traced reference of the scene. The reference has noise, and noise looks like an error. For a FLIP
+gate, rounds of paths are added until the reference's two halves differ, in FLIP, by no more than a part of the
+threshold, or a bound is reached; what they still differ by is stated with the result. The package has no part in that
+choice, so the same scene, camera and threshold have the same reference, whatever was baked.
+
+Where no gate compares pictures, one small picture is compared all the same (`package.pictures`), so that the report
+can say how the bake looks: from the first camera that the job names, else the scene file's, else from where the viewer
+looks first. Its number of paths is four times that of a light-field pixel, since who bakes better looks closer.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,7 +21,7 @@ import numpy as np
 import torch
 
 from kiln_schemas.camera import Camera
-from kiln_schemas.errors import InputError
+from kiln_schemas.errors import InputError, KilnError
 from kiln_schemas.gates import FLIP, LOG_MSE_REL, VISIBILITY_LOG_MSE_REL, GateResult
 from kiln_schemas.manifest import Manifest, ReferenceView
 from kiln_schemas.settings import Function
@@ -25,7 +29,9 @@ from kiln_schemas.tasks import FitMetrics, PackagePayload
 from kiln_workers.package import colour
 from kiln_workers.package.gates import Judgement, View
 from kiln_workers.render.backend import select_variant
+from kiln_workers.scene.gltf_camera import gltf_camera
 from kiln_workers.scene.model import Float32, Scene
+from kiln_workers.shade.first_camera import first_camera
 from kiln_workers.shade.gbuffer import render_gbuffer
 from kiln_workers.shade.image_metrics import flip, flip_noise_floor
 from kiln_workers.shade.package import ShadePackage
@@ -43,6 +49,17 @@ MOST_ROUNDS: Final = 16
 NOISE_SHARE: Final = 0.5
 """How much of the threshold the FLIP of the reference's halves may be."""
 
+PICTURE: Final = (192, 108)
+"""Width and height of the picture that is compared without a gate."""
+
+PATHS_A_SAMPLE: Final = 4
+LEAST_PATHS: Final = 64
+MOST_PATHS: Final = 1024
+"""Paths a pixel of that picture's reference: so many times `render.samples`, within these bounds."""
+
+FIRST_CAMERA: Final = "first"
+"""The name of the camera that nobody named."""
+
 LEAST_DEPTH: Final = 12
 """Scattering events of a reference's paths, at least: a bake whose own paths are too short is to be noticed."""
 
@@ -57,10 +74,11 @@ class GateJudge:
     scene: Scene
     metrics: Mapping[Function, FitMetrics]
     on_progress: Callable[[str], None]
+    read_blob: Callable[[str], bytes]
     results: tuple[GateResult, ...] = ()
 
     def __call__(self, folder: Path, manifest: Manifest) -> Judgement:
-        """The gates, and the pictures that FLIP compared."""
+        """The gates, and the pictures that were compared."""
         results: list[GateResult] = []
         views: list[View] = []
         for name, threshold in self.payload.gates.thresholds().items():
@@ -71,7 +89,39 @@ class GateJudge:
                 results.append(result)
                 views.append(view)
         self.results = tuple(results)
-        return Judgement(self.results, tuple(views))
+        if views:
+            return Judgement(self.results, tuple(views))
+        if not self.payload.settings.package.pictures:
+            return Judgement(self.results, not_compared="package.pictures is off")
+        try:
+            return Judgement(self.results, (self._first_look(folder, manifest),))
+        except KilnError as error:
+            # The package is whole without: no bake fails for a picture that nobody asked for.
+            return Judgement(
+                self.results, not_compared=f"{error.where}: {error.detail}" if error.where else error.detail
+            )
+
+    def _first_look(self, folder: Path, manifest: Manifest) -> View:
+        """The picture that is compared without a gate."""
+        name, camera = self._first_camera()
+        paths = min(max(PATHS_A_SAMPLE * self.payload.settings.render.samples, LEAST_PATHS), MOST_PATHS)
+        self.on_progress(f"shading from camera {name}")
+        picture = shaded(folder, manifest, camera, PICTURE)
+        self.on_progress(f"path-tracing from camera {name}")
+        reference = path_trace(self.scene, camera, *PICTURE, paths, self._depth())
+        value, noise = flip(reference.picture, picture), float(flip_noise_floor(reference.halves).mean())
+        return _view(name, camera, picture, reference, value, noise)
+
+    def _first_camera(self) -> tuple[str, Camera]:
+        """The first camera that the job names, else the scene file's own, else the viewer's first look."""
+        for name, camera in self.payload.cameras.items():
+            return name, camera
+        bundle = self.payload.bundle
+        stated = gltf_camera(self.read_blob(bundle.files[bundle.entry]), bundle.entry)
+        return FIRST_CAMERA, first_camera(self.scene, PICTURE[0] / PICTURE[1], stated)
+
+    def _depth(self) -> int:
+        return max(LEAST_DEPTH, self.payload.settings.render.max_depth + 1)
 
     def _log_mse_rel(self, name: str) -> float:
         function = _FUNCTIONS[name]
@@ -83,24 +133,36 @@ class GateJudge:
         """The FLIP gate of a camera."""
         camera = self.payload.cameras[name]
         self.on_progress(f"shading from camera {name}")
-        picture = shaded(folder, manifest, camera)
-        depth = max(LEAST_DEPTH, self.payload.settings.render.max_depth + 1)
+        picture = shaded(folder, manifest, camera, (WIDTH, HEIGHT))
         tell = partial(self.on_progress, f"path-tracing from camera {name}")
-        made, flip_of_halves = traced(self.scene, camera, depth, NOISE_SHARE * threshold, tell)
-        reference, noise = made.picture, float(flip_noise_floor(made.halves).mean())
-        value = flip(reference, picture)
+        reference, flip_of_halves = traced(self.scene, camera, self._depth(), NOISE_SHARE * threshold, tell)
+        value, noise = flip(reference.picture, picture), float(flip_noise_floor(reference.halves).mean())
         result = GateResult.of(FLIP + name, value, threshold, flip_of_halves=flip_of_halves, noise_floor=noise)
-        white = colour.white_point(reference)
-        seen = ReferenceView(camera=camera, white=white)
-        view = View(name, seen, colour.tone_map(picture, white), colour.tone_map(reference, white))
+        view = _view(name, camera, picture, reference, value, noise)
         return result, view
 
 
-def shaded(folder: Path, manifest: Manifest, camera: Camera) -> Float32:
-    """What the package in `folder` looks like, [HEIGHT, WIDTH, 3]."""
+def _view(name: str, camera: Camera, picture: Float32, reference: Reference, value: float, noise: float) -> View:
+    """The package's picture beside the reference, its FLIP and the reference's noise floor."""
+    white = colour.white_point(reference.picture)
+    height, width, _ = picture.shape
+    seen = ReferenceView(
+        camera=camera,
+        white=white,
+        flip=value,
+        noise_floor=noise,
+        samples=reference.samples,
+        width=width,
+        height=height,
+    )
+    return View(name, seen, colour.tone_map(picture, white), colour.tone_map(reference.picture, white))
+
+
+def shaded(folder: Path, manifest: Manifest, camera: Camera, size: tuple[int, int]) -> Float32:
+    """What the package in `folder` looks like, [H, W, 3]; `size` is width and height."""
     cuda = select_variant().startswith("cuda")
     package = ShadePackage.of(folder, manifest, torch.device("cuda" if cuda else "cpu"))
-    return shade(package, render_gbuffer(package.scene, camera, WIDTH, HEIGHT))
+    return shade(package, render_gbuffer(package.scene, camera, *size))
 
 
 def traced(

@@ -80,7 +80,13 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
     context.progress(steps - 1, steps, "steps", "writing the package")
     folder = context.scratch / "package"
     folder.mkdir()
-    judge = GateJudge(payload, scene, metrics, lambda message: context.progress(steps - 1, steps, "steps", message))
+    judge = GateJudge(
+        payload,
+        scene,
+        metrics,
+        on_progress=lambda message: context.progress(steps - 1, steps, "steps", message),
+        read_blob=context.blob,
+    )
     artifacts = build_package(
         folder,
         PackageInput(
