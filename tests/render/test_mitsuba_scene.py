@@ -1,6 +1,7 @@
 """Materials, textures and lights as Mitsuba sees them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -83,6 +84,30 @@ def test_cut_out_emitters_emit_where_they_are(
         tile = renderer(Scene((lamp,), (material,), (alpha,)), irradiance_samples=16384)
         got.append(tile.render(texels([(0.0, 0.0, 0.0)])).irradiance[0])
     np.testing.assert_allclose(got[1], 0.5 * got[0], rtol=0.02)
+
+
+@pytest.mark.parametrize("textured", [False, True])
+def test_an_alpha_test_takes_the_alpha_of_vertices_into_account(
+    textured: bool, quad: Callable[..., Mesh], texels: Callable[..., TexelBatch], renderer: Callable[..., TileRenderer]
+) -> None:
+    """Alpha rises from 0 to 1 across a lamp: the half where it is below the cutoff neither shines nor shadows."""
+    lamp = quad((-1, 1, -1), (2, 0, 0), (0, 0, 2))
+    colors = np.ones((4, 4), np.float32)
+    colors[[0, 3], 3] = 0.0
+    faded = Mesh(lamp.name, lamp.positions, lamp.normals, lamp.faces, 0, lamp.uv, colors=colors)
+    texture = TextureRef(0) if textured else None
+    image = Image("even", np.full((2, 2, 4), 255, np.uint8), srgb=True)
+    sun = PunctualLight("sun", LightKind.DIRECTIONAL, (20.0, 20.0, 20.0), direction=(0.0, -1.0, 0.0))
+    material = Material("m", (0, 0, 0, 1), texture, alpha_cutoff=0.5)
+    below = renderer(Scene((faded,), (material,), (image,), (sun,)), irradiance_samples=16)
+    shadow, _, _ = below.render_irradiance(texels([(-0.01, 0.0, 0.0), (0.01, 0.0, 0.0)]))
+    np.testing.assert_allclose(shadow, [[20.0] * 3, [0.0] * 3], rtol=1e-4)
+    glowing = (replace(material, emission=(3.0, 3.0, 3.0)),)
+    whole, half = (
+        renderer(Scene((mesh,), glowing, (image,)), irradiance_samples=16384).render_irradiance(texels([(0, 0, 0)]))[0]
+        for mesh in (lamp, faded)
+    )
+    np.testing.assert_allclose(half, 0.5 * whole, rtol=0.02)
 
 
 @pytest.mark.parametrize("double_sided", [False, True])

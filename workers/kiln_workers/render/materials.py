@@ -13,7 +13,7 @@ import numpy as np
 from kiln_workers.render import textures
 from kiln_workers.render.emitters import register_emitters
 from kiln_workers.render.gltf_bsdf import register_bsdfs
-from kiln_workers.render.jit import mi
+from kiln_workers.render.jit import dr, mi
 from kiln_workers.scene.images import linear_pixels
 from kiln_workers.scene.model import Float32, Material, Mesh, Scene, TextureRef
 
@@ -64,7 +64,7 @@ class MaterialBuilder:
     def __post_init__(self) -> None:
         register_emitters()
         register_bsdfs()
-        _register_lookup(mi.variant())
+        _register_textures(mi.variant())
 
     def bsdf(self, mesh: Mesh) -> Any:
         """The surface of a mesh."""
@@ -75,6 +75,7 @@ class MaterialBuilder:
             int(mesh.colors is not None),
             int(mesh.tangents is not None),
             int(rounded_emitter(mesh, material)),
+            int(_tested_by_vertices(material, mesh)),
         )
         if any(reference.wrap[0] != reference.wrap[1] for reference in material.textures):
             key = (*key, id(mesh))  # its textures are unrolled over this mesh's coordinates
@@ -158,6 +159,13 @@ class MaterialBuilder:
         if not (material.blend or material.alpha_cutoff is not None):
             return 1.0
         factor, reference = float(material.base_color[3]), material.base_color_texture
+        if _tested_by_vertices(material, mesh):
+            alpha = _uniform(factor)
+            if reference is not None and mesh.uv_of(reference) is not None:
+                alpha = _lookup(linear_pixels(self.scene.images[reference.image])[..., 3:] * factor, reference, mesh)
+            return mi.load_dict(
+                {"type": "kiln_alpha_test", "alpha": alpha, "cutoff": float(material.alpha_cutoff or 0)}
+            )
         if reference is None or mesh.uv_of(reference) is None:
             if material.alpha_cutoff is not None:
                 return 1.0 if factor >= material.alpha_cutoff else 0.0
@@ -167,6 +175,11 @@ class MaterialBuilder:
             return _lookup(np.clip(alpha, 0.0, 1.0)[..., None], reference, mesh)
         tested = textures.thresholded(alpha, material.alpha_cutoff, reference.wrap)
         return _lookup(tested, reference, mesh, nearest=True)
+
+
+def _tested_by_vertices(material: Material, mesh: Mesh) -> bool:
+    """Whether an alpha test depends on the vertices' alpha."""
+    return material.alpha_cutoff is not None and mesh.colors is not None and bool((mesh.colors[:, 3] != 1.0).any())
 
 
 def _uniform(value: float) -> Any:
@@ -186,7 +199,7 @@ def _lookup(pixels: Float32, reference: TextureRef, mesh: Mesh, nearest: bool = 
 
 
 @lru_cache(maxsize=4)
-def _register_lookup(variant: str) -> None:
+def _register_textures(variant: str) -> None:
     class KilnLookup(mi.Texture):  # type: ignore[misc]
         """A texture at the coordinates that a mesh attribute has."""
 
@@ -214,3 +227,22 @@ def _register_lookup(variant: str) -> None:
             return "KilnLookup[]"
 
     mi.register_texture("kiln_lookup", KilnLookup)
+
+    class KilnAlphaTest(mi.Texture):  # type: ignore[misc]
+        """1 where a texture times the vertices' alpha reaches the cutoff, else 0."""
+
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self.alpha, self.cutoff = properties["alpha"], float(properties["cutoff"])
+
+        def eval_1(self, si: Any, active: Any = True) -> Any:
+            alpha = self.alpha.eval_1(si, active) * si.shape.eval_attribute_1("vertex_alpha", si, active)
+            return dr.select(alpha >= self.cutoff, mi.Float(1.0), mi.Float(0.0))
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            return mi.Color3f(self.eval_1(si, active))
+
+        def to_string(self) -> str:
+            return "KilnAlphaTest[]"
+
+    mi.register_texture("kiln_alpha_test", KilnAlphaTest)

@@ -106,7 +106,9 @@ class TileRenderer:
     def render(self, texels: TexelBatch, on_progress: Progress = silent) -> TileImages:
         """All images of the batch; `on_progress` is called with the fraction done and may raise to stop."""
         fields = self.render_light_fields(texels, lambda done: on_progress(0.6 * done))
-        irradiance, irradiance_paths, dropped = self._irradiance(texels, lambda done: on_progress(0.6 + 0.2 * done))
+        irradiance, irradiance_paths, dropped = self.render_irradiance(
+            texels, lambda done: on_progress(0.6 + 0.2 * done)
+        )
         visibility = self._visibility(texels, lambda done: on_progress(0.8 + 0.2 * done))
         on_progress(1.0)
         return replace(
@@ -175,7 +177,8 @@ class TileRenderer:
         dr.eval(sums.radiance, sums.weight, sums.paths, sums.dropped)
         return sums
 
-    def _irradiance(self, texels: TexelBatch, on_progress: Progress) -> tuple[Float32, int, int]:
+    def render_irradiance(self, texels: TexelBatch, on_progress: Progress = silent) -> tuple[Float32, int, int]:
+        """Irradiance [T, 3] alone, how many paths it took, and how many were dropped because they were not finite."""
         samples = self.settings.irradiance_samples
         blocks = -(-samples // IRRADIANCE_BLOCK)
         total = np.zeros((len(texels), blocks, 3), np.float64)
