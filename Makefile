@@ -5,12 +5,13 @@
 # make hostile  thousands of attacks while another client bakes, then schemathesis at length (about half an hour)
 # make hostile-commands  every command of the command line with each option at odd values (about an hour)
 # make faults  bakes inputs that were once baked wrongly, against right values (about ten minutes)
+# make differential  200 random scenes against plain Mitsuba at random texels (about twenty minutes)
 # make venv   the virtual environment in .venv that these use
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test faults hostile hostile-commands lint node chromium faketime chaos clean
+.PHONY: help venv demo test faults differential hostile hostile-commands lint node chromium faketime chaos clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -64,6 +65,9 @@ hostile-commands: venv
 
 faults: venv
 	$(BIN)/python benchmarks/faults.py --json docs/results/faults.json --page docs/results/faults.md
+
+differential: venv
+	PYTHONPATH=tests/differential $(BIN)/python tests/differential/differential.py --json docs/results/differential.json --page docs/results/differential.md
 
 chaos: venv faketime
 	PYTHONPATH=$(FARM_TESTS) $(BIN)/python tests/chaos/chaos.py --store disk --faults 120 --json docs/results/chaos-disk.json
