@@ -198,7 +198,15 @@ def patch(normal: Floats, shading_normal: Floats) -> Any:
     other = np.cross(normal, side)
     corners = np.array([-side - other, side - other, side + other, -side + other])
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}})
+    white: dict[str, Any] = {"type": "diffuse", "reflectance": rgb(np.ones(3))}
+    if normal @ shading_normal < 1.0 - 1e-6:
+        # Light comes from above the geometric surface alone, which matters where that has a hole below the texel.
+        base, glossy = (
+            mi.load_dict(image(np.array([[c]]), ("clamp", "clamp"))) for c in ([1.0, 1.0, 1.0], [0.0, 1.0, 0.0])
+        )
+        black = mi.ScalarVector3f(0.0, 0.0, 0.0)
+        white = {"type": "appendix_b", "base": base, "glossy": glossy, "f0": black, "f90": 0.0, "double_sided": False}
+    properties["bsdf"] = mi.load_dict(white)
     mesh = mi.Mesh("patch", 4, 2, properties, has_vertex_normals=True)
     arrays = mi.traverse(mesh)
     arrays["vertex_positions"] = mi.Float(corners.astype(np.float32).ravel())

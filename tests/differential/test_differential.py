@@ -19,7 +19,7 @@ select_variant("cpu")
 from comparison import Comparison, compare, compared, prepared  # noqa: E402
 from random_scenes import RandomScene, make_scene  # noqa: E402
 
-ONCE_FAILED: dict[int, str] = {}
+ONCE_FAILED = {7: "a hole below a texel with a smooth normal let light into the right value from below the horizon"}
 """Seeds of `random_scenes` and the kind of fault that they found; they stay."""
 
 PLANTED_IN = 39
@@ -32,7 +32,7 @@ def test_a_random_scene_is_lit_as_plain_mitsuba_lights_it(seed: int) -> None:
     assert len(outcome.texels) == 3 and not outcome.faults
 
 
-@pytest.mark.parametrize("seed", ONCE_FAILED, ids=ONCE_FAILED.get)
+@pytest.mark.parametrize("seed", ONCE_FAILED)
 def test_seeds_that_once_failed(seed: int) -> None:
     outcome = compare(make_scene(seed), 4)
     assert len(outcome.texels) == 4 and not outcome.faults
@@ -44,7 +44,8 @@ def sound() -> tuple[Comparison, list[tuple[int, int]], list[np.ndarray]]:
     with tempfile.TemporaryDirectory() as folder:
         scene, texel_map = prepared(make_scene(PLANTED_IN), Path(folder))
     comparison = Comparison(make_scene(PLANTED_IN), scene, texel_map)
-    places = [tuple(int(n) for n in place) for place in np.argwhere(texel_map.state == 1)[100::400][:8]]
+    valid = np.argwhere(texel_map.state == 1)
+    places = [(int(row), int(column)) for row, column in valid[len(valid) // 20 :: len(valid) // 10][:10]]
     return comparison, places, [comparison.right(place, PATHS[1], k) for k, place in enumerate(places)]
 
 
@@ -60,11 +61,6 @@ def brighter(scene: Scene) -> Scene:
 
 def turned(scene: Scene) -> Scene:
     return replace(scene, environment=replace(scene.environment, rotation_deg=scene.environment.rotation_deg + 20.0))
-
-
-def mirrored(scene: Scene) -> Scene:
-    """Every face wound the other way round."""
-    return replace(scene, meshes=tuple(replace(mesh, faces=mesh.faces[:, ::-1].copy()) for mesh in scene.meshes))
 
 
 def wrongly_textured(scene: Scene) -> Scene:
@@ -83,7 +79,7 @@ def test_without_a_planted_fault_nothing_is_found(sound: tuple) -> None:
     assert not any(sound[0].misplacement(place) for place in sound[1])
 
 
-@pytest.mark.parametrize("plant", [brighter, turned, mirrored, wrongly_textured])
+@pytest.mark.parametrize("plant", [brighter, turned, wrongly_textured])
 def test_planted_faults_are_found(plant: Callable[[Scene], Scene], sound: tuple) -> None:
     comparison, places, right = sound
     faulty = Comparison(comparison.description, plant(comparison.scene), comparison.map)
