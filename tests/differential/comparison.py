@@ -36,6 +36,8 @@ BLOCK_PATHS: Final = (512, 1024)
 """Of the product and of Mitsuba, a block."""
 AGAIN: Final = 8
 SIGMAS: Final = 4.0
+ROUNDING: Final = 1e-4
+"""Relative error of a value without noise: float32 coordinates of a lamp and a texel."""
 MEMORY: Final = 1 << 27
 SKY_WIDTH: Final = 512
 
@@ -93,9 +95,9 @@ def numbers(values: Floats) -> str:
 
 
 def z_score(found: Floats, right: Floats, sigma: Floats) -> Floats:
-    """Deviations in standard errors; 0 where both are the same number without any error."""
+    """Deviations in standard errors of at least ROUNDING; 0 where both are the same number."""
     difference = found - right
-    return np.where(difference == 0.0, 0.0, difference / np.maximum(sigma, 1e-9 * np.abs(right) + 1e-30))
+    return np.where(difference == 0.0, 0.0, difference / np.maximum(sigma, ROUNDING * np.abs(right) + 1e-30))
 
 
 def prepared(scene: RandomScene, folder: Path) -> tuple[Scene, TexelMap]:

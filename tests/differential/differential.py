@@ -66,6 +66,9 @@ def summary(scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "largest_z": round(float(final.max(initial=0.0)), 2),
         "z_mean": round(float(first.mean()), 3) if len(first) else None,
         "z_standard_deviation": round(float(first.std()), 3) if len(first) else None,
+        "z_half_width_of_central_68_percent": round(float(np.subtract(*np.percentile(first, [84.13, 15.87]))) / 2.0, 3)
+        if len(first)
+        else None,
         "z_beyond_2": round(float((np.abs(first) > 2.0).mean()), 4) if len(first) else None,
         "z_beyond_3": round(float((np.abs(first) > 3.0).mean()), 4) if len(first) else None,
         "median_relative_sigma": round(float(np.median([t["relative_sigma"] for t in texels if t["sigma"] > 0.0])), 4)
