@@ -133,7 +133,8 @@ def test_lbfgs_is_at_least_as_good_as_adam_everywhere(lobe_field: TexelField) ->
     both = SOLVERS["lbfgs"](lobe_field, 3, given=[descent.representation.parameters])
     errors = [errors_at_texels(s.representation, lobe_field).error for s in (descent, alone, both)]
     assert errors[1].sum() < errors[0].sum()
-    assert (errors[2] <= errors[0] + 1e-6).all() and (errors[2] <= errors[1] + 1e-6).all()
+    rounding = 5e-6  # errors are those of lobes rounded to fp16, which the solvers do not see
+    assert (errors[2] <= errors[0] + rounding).all() and (errors[2] <= errors[1] + rounding).all()
     assert both.epochs > alone.epochs
 
 
