@@ -14,7 +14,6 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
@@ -113,9 +112,8 @@ def main() -> int:
     scenes = []
     seeds = range(options.first, options.first + options.scenes)
     # A process keeps compiled kernels; a new one now and then keeps memory small.
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.jobs, mp_context=spawn, max_tasks_per_child=20) as pool:
-        for scene in pool.map(measured, seeds):
+    with multiprocessing.get_context("spawn").Pool(options.jobs, maxtasksperchild=20) as pool:
+        for scene in pool.imap(measured, seeds):
             scenes.append(scene)
             print(
                 f"{scene['seed']:5d}  {scene['cpu_s']:5.1f} s  {'; '.join(scene['faults']) or 'as it should be'}",

@@ -28,7 +28,8 @@ def test_killed_processes_change_no_byte(farm: Farm, room_files: tuple[Path, Pat
     # The training process dies after a checkpoint; its parent starts another, which goes on from there.
     wait_until("a fit is running", lambda: is_active(farm, job, "fit"))
     before = blobs(farm)
-    wait_until("the fit has published a checkpoint", lambda: blobs(farm) > before)
+    # The second one is uploaded after the coordinator has been told of the first.
+    wait_until("the fit has published a checkpoint", lambda: blobs(farm) > before + 1)
     farm.kill("second", children_only=True)
     log = farm.folder / "second.log"
     wait_until("the fit goes on", lambda: ": going on from a checkpoint" in log.read_text())

@@ -11,6 +11,7 @@ import pytest
 from kiln_schemas.errors import TooLarge
 from kiln_workers.render.mitsuba_scene import to_mitsuba
 from kiln_workers.render.tile import TexelBatch, TileRenderer
+from kiln_workers.scene.lookup import look_up
 from kiln_workers.scene.model import Image, LightKind, Material, Mesh, PunctualLight, Scene, TextureRef
 from kiln_workers.sphere import ggx, octahedral
 
@@ -53,6 +54,20 @@ def test_wrap_modes_of_the_two_axes(quad: Callable[..., Mesh]) -> None:
     np.testing.assert_allclose(emission_at(mirrored, 0.8, 0.875), 2.0 * np.array(GREEN), atol=1e-5)
     np.testing.assert_allclose(emission_at(mirrored, 0.8, 0.375), 2.0 * np.array(WHITE), atol=1e-5)
     np.testing.assert_allclose(emission_at(mirrored, 0.8, 0.125), 2.0 * np.array(GREEN), atol=1e-5)
+
+
+@pytest.mark.parametrize("wrap", [("repeat", "mirror"), ("mirror", "clamp"), ("clamp", "repeat")])
+def test_a_texture_of_two_wrap_modes_is_interpolated_across_its_border(
+    quad: Callable[..., Mesh], wrap: tuple[str, str]
+) -> None:
+    """Everywhere, and so within half a pixel of the border too, as the look-up in numpy has it."""
+    scene = screen(quad, TextureRef(0, wrap=wrap), 1.0)
+    mesh, reference = scene.meshes[0], scene.materials[0].emission_texture
+    assert mesh.uv is not None and reference is not None
+    linear = QUADRANTS.astype(np.float64) / 255.0  # 0 and 255 are the same in sRGB
+    for x, y in [(0.01, 0.5), (0.99, 0.5), (0.5, 0.01), (0.5, 0.99), (0.02, 0.03), (0.97, 0.99), (0.3, 0.6)]:
+        right = 2.0 * look_up(linear, reference, np.array([[x, 1.0 - y]]))[0]
+        np.testing.assert_allclose(emission_at(scene, x, y), right, atol=1e-4)
 
 
 def test_unrolling_is_bounded(quad: Callable[..., Mesh]) -> None:

@@ -65,8 +65,11 @@ def _unrolled(pixels: Float32, reference: TextureRef, matrix: Floats, uv: Float3
             where=f"image {reference.image}",
             remedy="Use one wrap mode for both axes, or keep the coordinates near [0, 1].",
         )
-    columns = wrapped(np.arange(low[0] * width, high[0] * width), width, reference.wrap[0])
-    rows = wrapped(np.arange(low[1] * height, high[1] * height), height, reference.wrap[1])
-    span = (high - low).astype(np.float64)
-    window = np.array([[1 / span[0], 0.0, -low[0] / span[0]], [0.0, 1 / span[1], -low[1] / span[1]], [0.0, 0.0, 1.0]])
+    # One more pixel on each side: within half a pixel of the border it is interpolated with its neighbour beyond.
+    sizes = np.array([width, height])
+    start, count = low * sizes - 1, (high - low) * sizes + 2
+    columns = wrapped(np.arange(start[0], start[0] + count[0]), width, reference.wrap[0])
+    rows = wrapped(np.arange(start[1], start[1] + count[1]), height, reference.wrap[1])
+    scale, offset = sizes / count, -start / count
+    window = np.array([[scale[0], 0.0, offset[0]], [0.0, scale[1], offset[1]], [0.0, 0.0, 1.0]])
     return pixels[rows[:, None], columns[None, :]], window
