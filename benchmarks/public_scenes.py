@@ -1,11 +1,11 @@
 """Bakes scenes as they come and compares a picture of each package with a path-traced one.
 
-    python benchmarks/public_scenes.py FOLDER --env HDR --out FOLDER [--json FILE] [--page FILE]
+    python benchmarks/public_scenes.py FOLDER --env HDR --out FOLDER [--json FILE]
 
 FOLDER holds scenes (.glb, .gltf, .obj, .ply ...), also in folders of their own. Each is baked by
-`lightkiln bake SCENE --env HDR --preset draft` and nothing more. The camera looks from the front, right and above at
-the whole scene. OUT/NAME.png has the shaded package on the left, the path-traced scene on the right. What is in OUT
-already is not baked again.
+`lightkiln bake SCENE --env HDR --preset draft` and nothing more. The camera is that of the report's picture. In
+OUT/NAME.png the shaded package is on the left, the path-traced scene on the right. What is in OUT already is not baked
+again.
 
 - covered: part of the light map that charts touch. specks: part of that in charts of four texels or fewer.
 - FLIP: mean HDR-FLIP of the shaded package against the path-traced picture; noise: what FLIP the noise of the latter
@@ -32,21 +32,6 @@ from kiln_workers.shade.package import read_exr
 
 SUFFIXES: Final = {".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".xml"}
 SIZE: Final = "480x360"
-TOWARDS_EYE: Final = np.array([0.5, 0.4, 0.77])
-FOV_DEG: Final = 35.0
-MARKS: Final = ("<!-- begin of the table of public_scenes.py -->", "<!-- end of the table -->")
-
-
-def camera_of(scene: Path) -> tuple[str, int]:
-    """The camera as the command line takes it, and how many triangles the scene has."""
-    loaded = load_scene(scene.parent, scene.name)
-    points = np.concatenate([mesh.positions for mesh in loaded.meshes]).astype(np.float64) + np.asarray(loaded.origin)
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
-    towards = TOWARDS_EYE / np.linalg.norm(TOWARDS_EYE)
-    eye = middle + towards * radius / np.sin(np.radians(FOV_DEG / 2))
-    place = ":".join(",".join(f"{x:.9g}" for x in point) for point in (eye, middle))
-    return f"{place}:{FOV_DEG:g}", sum(len(mesh.faces) for mesh in loaded.meshes)
 
 
 def lightkiln(*words: str) -> subprocess.CompletedProcess[str]:
@@ -64,7 +49,7 @@ def bake(scene: Path, environment: Path, out: Path, samples: int) -> dict[str, A
     if kept.exists():
         return dict(json.loads(kept.read_text()))
     try:
-        camera, row["triangles"] = camera_of(scene)
+        row["triangles"] = load_scene(scene.parent, scene.name).triangles
     except InputError as error:
         return row | {"fault": str(error)}
     sky = ["--env", str(environment)]
@@ -83,8 +68,12 @@ def bake(scene: Path, environment: Path, out: Path, samples: int) -> dict[str, A
     irradiance = manifest["textures"]["irradiance.ktx2"]
     row["size"] = irradiance["width"]
     row["covered"] = lightmap["covered"] / (irradiance["width"] * irradiance["height"])
+    if not manifest["views"]:
+        return row | {"fault": "the report has no picture of it"}
+    camera = out / f"{name}-camera.json"
+    camera.write_text(json.dumps(next(iter(manifest["views"].values()))["camera"]))
     shaded, traced = out / f"{name}-shaded.exr", out / f"{name}-traced.exr"
-    view = ["--camera", camera, "--size", SIZE, "--json"]
+    view = ["--camera", str(camera), "--size", SIZE, "--json"]
     for command in (
         ["shade", str(package), *view, "--out", str(shaded)],
         ["reference", str(scene), *sky, *view, "--samples", str(samples), "--out", str(traced)],
@@ -122,19 +111,13 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--samples", type=int, default=128, help="paths a pixel of the path-traced pictures")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--page", type=Path, help="Markdown file whose table is replaced")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for scene in sorted(path for path in options.folder.rglob("*") if path.suffix.lower() in SUFFIXES):
         rows.append(bake(scene, options.env, options.out, options.samples))
         print(rows[-1], flush=True)
-    lines = list(table(rows))
-    print("\n".join(lines))
-    if options.page:
-        text = options.page.read_text()
-        begin, end = (text.index(mark) for mark in MARKS)
-        options.page.write_text(text[: begin + len(MARKS[0])] + "\n" + "\n".join(lines) + "\n" + text[end:])
+    print("\n".join(table(rows)))
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1) + "\n")
     return 1 if any("fault" in row for row in rows) else 0

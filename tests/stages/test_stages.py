@@ -228,6 +228,16 @@ def test_flip_is_that_of_the_package_as_downloaded(baked: Baked, downloaded: Pat
     assert shown[0].shape == (270, 480, 3) and shown[0].mean() == pytest.approx(shown[1].mean(), rel=0.2)
 
 
+def payload_of_gates(baked: Baked, **changes: Any) -> PackagePayload:
+    """What a package task is given, as far as gates look at it."""
+    fields = {
+        **{"job_id": "j", "job_name": "room", "renders": (), "fits": (), "store_url": ""},
+        **{"bundle": baked.prepare_payload.bundle, "prepare": baked.prepared},
+        "settings": baked.prepare_payload.settings,
+    }
+    return PackagePayload(**fields | changes)
+
+
 def test_a_package_without_its_irradiance_misses_the_gate(
     baked: Baked, downloaded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -235,18 +245,7 @@ def test_a_package_without_its_irradiance_misses_the_gate(
     monkeypatch.setattr(gates, "HEIGHT", 54)
     shutil.copytree(downloaded, tmp_path / "dark")
     write_rgb(tmp_path / "dark" / "irradiance.exr", np.zeros((16, 16, 3), np.float32))
-    payload = PackagePayload(
-        job_id="j",
-        job_name="room",
-        bundle=baked.prepare_payload.bundle,
-        prepare=baked.prepared,
-        renders=(),
-        fits=(),
-        settings=baked.prepare_payload.settings,
-        store_url="",
-        gates=Gates(flip={"front": 0.3}),
-        cameras={"front": FRONT},
-    )
+    payload = payload_of_gates(baked, gates=Gates(flip={"front": 0.3}), cameras={"front": FRONT})
     told: list[str] = []
     scene = unpack_scene(baked.context.blob(baked.prepared.scene))
     judge = gates.GateJudge(payload, scene, {}, told.append, baked.context.blob)
@@ -264,17 +263,8 @@ def test_without_a_gate_one_picture_is_compared(baked: Baked, downloaded: Path, 
     scene = unpack_scene(baked.context.blob(baked.prepared.scene))
 
     def judged(folder: Path, *overrides: str, cameras: dict[str, Camera] | None = None) -> Judgement:
-        payload = PackagePayload(
-            job_id="j",
-            job_name="room",
-            bundle=baked.prepare_payload.bundle,
-            prepare=baked.prepared,
-            renders=(),
-            fits=(),
-            settings=make_settings("draft", [*TINY, "package.pictures=on", *overrides]),
-            store_url="",
-            cameras=cameras or {},
-        )
+        settings = make_settings("draft", [*TINY, "package.pictures=on", *overrides])
+        payload = payload_of_gates(baked, settings=settings, cameras=cameras or {})
         judge = gates.GateJudge(payload, scene, {}, lambda message: None, baked.context.blob)
         return judge(folder, read_manifest(folder))
 

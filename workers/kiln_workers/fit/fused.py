@@ -1,6 +1,6 @@
 """The log loss of each texel and its gradient in one pass over its pixels, compiled for this machine's CPU.
 
-The slow, obvious twin is `fit.solvers.losses.reference_texel_losses`; tests compare them. As products of matrices, the
+The slow, obvious twin is `fit.loss.losses_by_products`; tests compare them. As products of matrices, the
 loss spends most of its time on arrays [T, K, N] that are written and read again. Here PIXELS pixels at a time stay in
 the first-level cache from the exponential to the gradient, and pixels of no weight are skipped.
 

@@ -8,6 +8,7 @@ sharpness at which N such lobes cover a hemisphere evenly.
 """
 
 import math
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -23,6 +24,35 @@ LOG_AMPLITUDE: Final = (-14.0, 11.0)
 """Range of log mu in exposure-normalised radiance (the scene's mean is 0.18)."""
 
 START_AMPLITUDE: Final = 0.05
+
+
+@dataclass(frozen=True)
+class LogRange:
+    """A positive parameter's logarithm is middle + half tanh(offset + raw / half): between bounds, at `start` for 0."""
+
+    low: float
+    high: float
+    start: float
+
+    @property
+    def middle(self) -> float:
+        return (self.low + self.high) / 2.0
+
+    @property
+    def half(self) -> float:
+        return (self.high - self.low) / 2.0
+
+    @property
+    def offset(self) -> float:
+        return math.atanh((self.start - self.middle) / self.half)
+
+
+AMPLITUDE_RANGE: Final = LogRange(*LOG_AMPLITUDE, math.log(START_AMPLITUDE))
+
+
+def sharpness_range(lobes: int) -> LogRange:
+    """N lobes start as sharp as N that cover a hemisphere evenly."""
+    return LogRange(*LOG_SHARPNESS, math.log(max(lobes, 2)))
 
 
 def fibonacci_axes(count: int) -> Tensor:
@@ -43,8 +73,8 @@ def constrain(raw: Tensor, normals: Tensor) -> Tensor:
     """Lobes [T, N, 7] in exposure-normalised radiance from outputs [T, N, 7] and unit normals [T, 3]."""
     count = raw.shape[1]
     axis = torch.nn.functional.normalize(start_axes(count, normals) + raw[..., :3], dim=-1, eps=1e-6)
-    sharpness = _bounded_exp(raw[..., 3:4], math.log(max(count, 2)), LOG_SHARPNESS)
-    amplitude = _bounded_exp(raw[..., 4:LOBE_PARAMETERS], math.log(START_AMPLITUDE), LOG_AMPLITUDE)
+    sharpness = _bounded_exp(raw[..., 3:4], sharpness_range(count))
+    amplitude = _bounded_exp(raw[..., 4:LOBE_PARAMETERS], AMPLITUDE_RANGE)
     return torch.cat([axis, sharpness, amplitude], dim=-1)
 
 
@@ -55,9 +85,6 @@ def start_axes(count: int, normals: Tensor) -> Tensor:
     return start - 2.0 * below[..., None] * normals[:, None, :]
 
 
-def _bounded_exp(raw: Tensor, start: float, bounds: tuple[float, float]) -> Tensor:
-    """exp(start + raw) near raw = 0, saturating smoothly towards exp(bounds), so that no output is ever stuck."""
-    low, high = bounds
-    middle, half = (low + high) / 2.0, (high - low) / 2.0
-    offset = math.atanh((start - middle) / half)
-    return torch.exp(middle + half * torch.tanh(offset + raw / half))
+def _bounded_exp(raw: Tensor, bounds: LogRange) -> Tensor:
+    """exp(start + raw) near raw = 0, saturating smoothly towards the bounds, so that no output is ever stuck."""
+    return torch.exp(bounds.middle + bounds.half * torch.tanh(bounds.offset + raw / bounds.half))

@@ -48,8 +48,29 @@ def reference_loss(lobes: Tensor, log_targets: Tensor, directions: Tensor, weigh
     return (weights[..., None] * (torch.log1p(predicted) - log_targets) ** 2).sum()
 
 
+def losses_by_products(
+    lobes: Tensor, log_targets: Tensor, directions: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The loss of each texel [T] and its gradient [T, N, 7] as products of matrices, in any precision, on any device.
+
+    The slow twin of `fused.losses_and_gradient`. Directions are [K, 3], or each texel's own [T, K, 3].
+    """
+    values, predicted = lobe_values(lobes, directions)
+    difference = torch.log1p(predicted).sub_(log_targets)
+    weighted = difference * weights[..., None]
+    losses = (weighted * difference).sum(dim=(1, 2))
+    by_predicted = weighted.mul_(2.0).div_(predicted.add_(1.0))  # [T, K, 3]
+    by_amplitude = values.transpose(1, 2) @ by_predicted
+    by_exponent = (by_predicted @ lobes[..., 4:].transpose(1, 2)).mul_(values)  # [T, K, N]
+    by_scaled = by_exponent.transpose(1, 2) @ _homogeneous(directions)  # [T, N, 4]
+    axis, sharpness = lobes[..., :3], lobes[..., 3:4]
+    by_axis = by_scaled[..., :3] * sharpness
+    by_sharpness = (by_scaled[..., :3] * axis).sum(dim=-1, keepdim=True) + by_scaled[..., 3:4]
+    return losses, torch.cat([by_axis, by_sharpness, by_amplitude], dim=-1)
+
+
 def lobe_values(lobes: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """exp(lambda (v.u - 1)) [T, K, N] and P [T, K, 3] of lobes [T, N, 7] in directions [K, 3]."""
+    """exp(lambda (v.u - 1)) [T, K, N] and P [T, K, 3] of lobes [T, N, 7] in directions [K, 3] or [T, K, 3]."""
     sharpness = lobes[..., 3:4]
     scaled = torch.cat([lobes[..., :3] * sharpness, sharpness], dim=-1)  # (lambda u, lambda) . (v, -1)
     values = (_homogeneous(directions) @ scaled.transpose(1, 2)).exp_()
@@ -57,7 +78,7 @@ def lobe_values(lobes: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _homogeneous(directions: Tensor) -> Tensor:
-    return torch.cat([directions, -torch.ones_like(directions[:, :1])], dim=1)
+    return torch.cat([directions, -torch.ones_like(directions[..., :1])], dim=-1)
 
 
 class _LogLoss(torch.autograd.Function):
@@ -68,21 +89,10 @@ class _LogLoss(torch.autograd.Function):
         if lobes.device.type == "cpu" and lobes.dtype == torch.float32:
             index = torch.arange(len(directions), dtype=torch.int32).expand(weights.shape)
             losses, gradient = losses_and_gradient(lobes, log_targets, directions, index, weights)
-            ctx.save_for_backward(gradient)
-            return losses.sum()
-        values, predicted = lobe_values(lobes, directions)
-        difference = torch.log1p(predicted) - log_targets
-        weighted = difference * weights[..., None]
-        loss = (weighted * difference).sum()
-        by_predicted = weighted.mul_(2.0).div_(predicted.add_(1.0))  # [T, K, 3]
-        by_amplitude = values.transpose(1, 2) @ by_predicted
-        by_exponent = (by_predicted @ lobes[..., 4:].transpose(1, 2)).mul_(values)  # [T, K, N]
-        by_scaled = by_exponent.transpose(1, 2) @ _homogeneous(directions)  # [T, N, 4]
-        axis, sharpness = lobes[..., :3], lobes[..., 3:4]
-        by_axis = by_scaled[..., :3] * sharpness
-        by_sharpness = (by_scaled[..., :3] * axis).sum(dim=-1, keepdim=True) + by_scaled[..., 3:4]
-        ctx.save_for_backward(torch.cat([by_axis, by_sharpness, by_amplitude], dim=-1))
-        return loss
+        else:
+            losses, gradient = losses_by_products(lobes, log_targets, directions, weights)
+        ctx.save_for_backward(gradient)
+        return losses.sum()
 
     @staticmethod
     def backward(ctx: FunctionCtx, *outer: Any) -> tuple[Tensor, None, None, None]:

@@ -48,15 +48,6 @@ class Reference:
         noise = 0.5 * (self.halves[0].astype(np.float64) - self.halves[1])
         return float(np.sqrt(np.mean(np.square(noise))) / max(float(self.picture.mean()), 1e-30))
 
-    def joined(self, other: "Reference") -> "Reference":
-        """Both references' paths together."""
-        total = self.samples + other.samples
-        halves = tuple(
-            ((self.samples * a.astype(np.float64) + other.samples * b) / total).astype(np.float32)
-            for a, b in zip(self.halves, other.halves, strict=True)
-        )
-        return Reference((halves[0], halves[1]), total)
-
 
 def path_trace(
     scene: Scene,

@@ -114,8 +114,8 @@ class GateJudge:
 
     def _first_camera(self) -> tuple[str, Camera]:
         """The first camera that the job names, else the scene file's own, else the viewer's first look."""
-        for name, camera in self.payload.cameras.items():
-            return name, camera
+        if self.payload.cameras:
+            return next(iter(self.payload.cameras.items()))
         bundle = self.payload.bundle
         stated = gltf_camera(self.read_blob(bundle.files[bundle.entry]), bundle.entry)
         return FIRST_CAMERA, first_camera(self.scene, PICTURE[0] / PICTURE[1], stated)

@@ -5,13 +5,12 @@ as Adam says. The slow, obvious twins are `fit.lobes.constrain` with autograd, `
 `Neighbourhood.pull` and `optimizer.Moments`; tests compare them.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from kiln_workers.fit.lobes import LOG_AMPLITUDE, LOG_SHARPNESS, START_AMPLITUDE
+from kiln_workers.fit.lobes import AMPLITUDE_RANGE, sharpness_range
 from kiln_workers.fit.machine_code import BOXES, INDEX, INDEX_ROWS, ROWS, SINGLE, compiled
 from kiln_workers.fit.optimizer import BETA_1, BETA_2
 from kiln_workers.fit.source import Float32, Index
@@ -24,11 +23,8 @@ f32 = np.float32
 
 def bounds(lobes: int) -> Float32:
     """Middle, half and offset [2, 3] of the logarithms of sharpness and amplitude, as `fit.lobes.constrain` has."""
-    rows = []
-    for start, (low, high) in ((math.log(max(lobes, 2)), LOG_SHARPNESS), (math.log(START_AMPLITUDE), LOG_AMPLITUDE)):
-        middle, half = (low + high) / 2.0, (high - low) / 2.0
-        rows.append((middle, half, math.atanh((start - middle) / half)))
-    return np.array(rows, f32)
+    ranges = (sharpness_range(lobes), AMPLITUDE_RANGE)
+    return np.array([(one.middle, one.half, one.offset) for one in ranges], f32)
 
 
 @compiled(BOXES, BOXES, ROWS, BOXES)

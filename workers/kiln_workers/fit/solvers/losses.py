@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kiln_workers.fit.fused import losses_and_gradient
 from kiln_workers.fit.lobes import constrain
+from kiln_workers.fit.loss import losses_by_products
 
 NORMALISATION: Final = 2.0 * math.pi * 3.0
 
@@ -29,21 +30,7 @@ def reference_texel_losses(
     lobes: Tensor, log_targets: Tensor, directions: Tensor, weights: Tensor
 ) -> tuple[Tensor, Tensor]:
     """`texel_losses` as products of matrices, in any precision and on any device."""
-    axis, sharpness, amplitude = lobes[..., :3], lobes[..., 3:4], lobes[..., 4:]
-    scaled = torch.cat([axis * sharpness, sharpness], dim=-1)
-    homogeneous = torch.cat([directions, -torch.ones_like(directions[..., :1])], dim=-1)  # [T, K, 4]
-    values = torch.bmm(homogeneous, scaled.transpose(1, 2)).exp_()  # [T, K, N]
-    predicted = torch.bmm(values, amplitude)
-    difference = torch.log1p(predicted).sub_(log_targets)
-    weighted = difference * (weights / NORMALISATION)[..., None]
-    losses = (weighted * difference).sum(dim=(1, 2))
-    by_predicted = weighted.mul_(2.0).div_(predicted.add_(1.0))
-    by_amplitude = torch.bmm(values.transpose(1, 2), by_predicted)
-    by_exponent = torch.bmm(by_predicted, amplitude.transpose(1, 2)).mul_(values)
-    by_scaled = torch.bmm(by_exponent.transpose(1, 2), homogeneous)  # [T, N, 4]
-    by_axis = by_scaled[..., :3] * sharpness
-    by_sharpness = (by_scaled[..., :3] * axis).sum(dim=-1, keepdim=True) + by_scaled[..., 3:4]
-    return losses, torch.cat([by_axis, by_sharpness, by_amplitude], dim=-1)
+    return losses_by_products(lobes, log_targets, directions, weights / NORMALISATION)
 
 
 def raw_losses(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kiln_schemas.conventions import LOBE_PARAMETERS
 from kiln_workers.fit.field import TexelField
-from kiln_workers.fit.lobes import LOG_AMPLITUDE, LOG_SHARPNESS, START_AMPLITUDE, fibonacci_axes
+from kiln_workers.fit.lobes import AMPLITUDE_RANGE, LogRange, sharpness_range, start_axes
 
 RANDOM_SPREAD: Final = 0.5
 """Standard deviation of log sharpness and log amplitude of a random start."""
@@ -40,27 +40,19 @@ def random_start(field: TexelField, lobes: int, seed: int = 0) -> Tensor:
         axes -= 2.0 * np.minimum(axes @ normal, 0.0)[:, None] * normal
         raw[texel, :, :3] = axes
         raw[texel, :, 3:] = RANDOM_SPREAD * rng.standard_normal((lobes, LOBE_PARAMETERS - 3))
-    raw[..., :3] -= _folded(torch.from_numpy(field.normals), lobes).numpy()
+    raw[..., :3] -= start_axes(lobes, torch.from_numpy(field.normals)).numpy()
     return torch.from_numpy(raw)
 
 
 def unconstrain(lobes: Tensor, normals: Tensor) -> Tensor:
     """The parameters [T, N, 7] from which `fit.lobes.constrain` makes lobes [T, N, 7]; out of bounds are moved in."""
     count = lobes.shape[1]
-    axis = lobes[..., :3] - _folded(normals, count)
-    sharpness = _raw_of(lobes[..., 3:4], math.log(max(count, 2)), LOG_SHARPNESS)
-    amplitude = _raw_of(lobes[..., 4:], math.log(START_AMPLITUDE), LOG_AMPLITUDE)
+    axis = lobes[..., :3] - start_axes(count, normals)
+    sharpness = _raw_of(lobes[..., 3:4], sharpness_range(count))
+    amplitude = _raw_of(lobes[..., 4:], AMPLITUDE_RANGE)
     return torch.cat([axis, sharpness, amplitude], dim=-1)
 
 
-def _folded(normals: Tensor, count: int) -> Tensor:
-    """The axes [T, N, 3] of the shared start."""
-    axes = fibonacci_axes(count)
-    return axes - 2.0 * (normals @ axes.T).clamp(max=0.0)[..., None] * normals[:, None, :]
-
-
-def _raw_of(value: Tensor, start: float, bounds: tuple[float, float]) -> Tensor:
-    low, high = bounds
-    middle, half = (low + high) / 2.0, (high - low) / 2.0
-    place = ((value.clamp(min=math.exp(low)).log() - middle) / half).clamp(-_INSIDE, _INSIDE)
-    return half * (torch.atanh(place) - math.atanh((start - middle) / half))
+def _raw_of(value: Tensor, bounds: LogRange) -> Tensor:
+    place = ((value.clamp(min=math.exp(bounds.low)).log() - bounds.middle) / bounds.half).clamp(-_INSIDE, _INSIDE)
+    return bounds.half * (torch.atanh(place) - bounds.offset)
