@@ -65,9 +65,8 @@ def bake(scene: Path, environment: Path, out: Path, samples: int) -> dict[str, A
         "specks": lightmap["speck_share"],
         "log_mse_rel": manifest["metrics"]["light_field"]["log_mse_rel"],
     }
-    irradiance = manifest["textures"]["irradiance.ktx2"]
-    row["size"] = irradiance["width"]
-    row["covered"] = lightmap["covered"] / (irradiance["width"] * irradiance["height"])
+    row["size"] = lightmap["width"]
+    row["covered"] = lightmap["covered"] / (lightmap["width"] * lightmap["height"])
     if not manifest["views"]:
         return row | {"fault": "the report has no picture of it"}
     camera = out / f"{name}-camera.json"

@@ -39,6 +39,8 @@ ARRAY_LIGHT_FIELD: Final = "light_field"
 ARRAY_VISIBILITY: Final = "visibility"
 ARRAY_IRRADIANCE: Final = "irradiance"
 ARRAY_BETWEEN: Final = "between"
+ARRAY_FINE_IRRADIANCE: Final = "fine_irradiance"
+"""Indexed by texels of the irradiance map, which is finer (`lightmap.irradiance_scale`)."""
 
 # Artifacts of a package.
 LIGHT_FIELD_KTX2: Final = "lightfield.ktx2"

@@ -86,6 +86,9 @@ class LightmapSettings(Contract):
         le=LARGEST_SIDE,
         description="texels a side that `auto` ends at, unless the charts find no room in them",
     )
+    irradiance_scale: int = Field(
+        default=1, ge=1, le=8, description="irradiance texels along each side of a texel: contact shadows need them"
+    )
     padding: int = Field(default=2, ge=1, le=16, description="empty texels between charts when unwrapping")
     uv: UvPolicy = UvPolicy.AUTO
     tile: int = Field(default=16, ge=4, le=64, description="texels along each side of a render tile")
@@ -97,6 +100,10 @@ class LightmapSettings(Contract):
         if chosen is None:
             raise InputError("the prepare task chose no resolution", where="lightmap.resolution")
         return chosen
+
+    def irradiance_side(self, side: int) -> int:
+        """Texels along each side of the irradiance map of a light map of `side`: a multiple, at most LARGEST_SIDE."""
+        return side * min(self.irradiance_scale, max(LARGEST_SIDE // side, 1))
 
     @model_validator(mode="after")
     def _bounds_in_order(self) -> "LightmapSettings":
@@ -110,7 +117,9 @@ class RenderSettings(Contract):
 
     image_size: int = Field(ge=16, le=256, description="pixels along each side of a light-field image")
     samples: int = Field(default=16, ge=1, le=65536, description="paths per light-field pixel")
-    irradiance_samples: int = Field(default=1024, ge=1, le=1_000_000, description="paths per texel")
+    irradiance_samples: int = Field(
+        default=1024, ge=1, le=1_000_000, description="paths per texel of the irradiance map"
+    )
     between_samples: int = Field(
         default=64, ge=0, le=65536, description="paths per pixel of the sparse light fields between texels; 0: none"
     )
@@ -188,20 +197,20 @@ class BakeSettings(Contract):
 PRESETS: Final[Mapping[str, BakeSettings]] = {
     "draft": BakeSettings(
         preset="draft",
-        lightmap=LightmapSettings(density=1.4, least=32, most=128, tile=8),
+        lightmap=LightmapSettings(density=1.4, least=32, most=128, irradiance_scale=4, tile=8),
         render=RenderSettings(image_size=32, samples=32, irradiance_samples=512),
         fit=FitSettings(lobes=8, steps=1000, start_steps=500, visibility_steps=500),
         package=PackageSettings(environment_size=64),
     ),
     "preview": BakeSettings(
         preset="preview",
-        lightmap=LightmapSettings(density=2.8, least=64, most=256),
+        lightmap=LightmapSettings(density=2.8, least=64, most=256, irradiance_scale=4),
         render=RenderSettings(image_size=64, samples=128),
         fit=FitSettings(lobes=16, steps=2500),
     ),
     "production": BakeSettings(
         preset="production",
-        lightmap=LightmapSettings(density=22.0, least=512, most=1024),
+        lightmap=LightmapSettings(density=22.0, least=512, most=1024, irradiance_scale=2),
         render=RenderSettings(image_size=128, samples=128, irradiance_samples=4096, max_depth=8),
         fit=FitSettings(lobes=16, steps=60_000, start_steps=20_000, visibility_steps=24_000),
         package=PackageSettings(environment_size=256),

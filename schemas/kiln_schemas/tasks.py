@@ -105,6 +105,8 @@ class RenderPayload(Contract):
     texel_map: Sha256
     between: Between = ()
     """Texel maps of the between points, one a kind (`PrepareResult.between`)."""
+    fine: Sha256 | None = None
+    """The texel map of the irradiance map (`PrepareResult.fine`)."""
     tile: Tile
     settings: BakeSettings
     store_url: Url
@@ -170,6 +172,8 @@ class PrepareResult(Contract):
     """The texel map (`kiln_workers.scene.texels`)."""
     between: Between = ()
     """Texel maps of the points half-way between texels: to the right, below, and the corner; none where unused."""
+    fine: Sha256 | None = None
+    """The texel map of the irradiance map; None where the light map has no finer one (`lightmap.irradiance_scale`)."""
     scene_hash: Sha256
     """Hash of all that the light depends on; render seeds derive from it."""
     resolution: int | None = Field(default=None, ge=SMALLEST_SIDE, le=LARGEST_SIDE)

@@ -12,7 +12,13 @@ from typing import Any, Final
 import obstore
 from obstore.exceptions import BaseError
 
-from kiln_schemas.conventions import ARRAY_BETWEEN, ARRAY_IRRADIANCE, ARRAY_LIGHT_FIELD, ARRAY_VISIBILITY
+from kiln_schemas.conventions import (
+    ARRAY_BETWEEN,
+    ARRAY_FINE_IRRADIANCE,
+    ARRAY_IRRADIANCE,
+    ARRAY_LIGHT_FIELD,
+    ARRAY_VISIBILITY,
+)
 from kiln_service.blobs import open_objects
 from kiln_service.config import ServiceConfig
 from kiln_service.db import Database, JobRow
@@ -24,6 +30,7 @@ TAILS: Final[Mapping[str, str]] = {
     ARRAY_VISIBILITY: "/0/0/0",
     ARRAY_BETWEEN: "/0/0/0/0",
     ARRAY_IRRADIANCE: "/0",
+    ARRAY_FINE_IRRADIANCE: "/0",
 }
 """What follows the tile's row and column in the name of its object."""
 
@@ -95,6 +102,8 @@ def _arrays(job: JobRow) -> Sequence[str]:
         arrays.append(ARRAY_VISIBILITY)
     if job.prepared.get("between"):
         arrays.append(ARRAY_BETWEEN)
+    if job.prepared.get("fine"):
+        arrays.append(ARRAY_FINE_IRRADIANCE)
     return arrays
 
 

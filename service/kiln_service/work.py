@@ -474,7 +474,7 @@ def _blobs_of(result: Result) -> list[str]:
     """Hashes that the result names."""
     match result:
         case PrepareResult():
-            return [result.scene, result.texel_map, *result.between]
+            return [result.scene, result.texel_map, *result.between, *([result.fine] if result.fine else [])]
         case FitResult():
             return [result.weights]
         case RefineResult():

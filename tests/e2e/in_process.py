@@ -91,6 +91,7 @@ class Baked:
             scene=self.prepared.scene,
             texel_map=self.prepared.texel_map,
             between=self.prepared.between,
+            fine=self.prepared.fine,
             tile=self.prepared.tiles[index],
             settings=self.prepare_payload.settings,
             store_url=self.prepare_payload.store_url,
@@ -120,7 +121,8 @@ def bake(folder: Path, scene: Scene, settings: BakeSettings, **asked: Any) -> Ba
     maps: dict[str, Any] = {"texel_map": prepared.texel_map, **common}
     placed: dict[str, Any] = {"between": prepared.between, **maps}
     renders = tuple(
-        render.run(RenderPayload(scene=prepared.scene, tile=tile, **placed), context) for tile in prepared.tiles
+        render.run(RenderPayload(scene=prepared.scene, fine=prepared.fine, tile=tile, **placed), context)
+        for tile in prepared.tiles
     )
     functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if environment else [])
     fits = tuple(fit.run(FitPayload(function=f, renders=renders, **maps), context) for f in functions)

@@ -184,6 +184,7 @@ def sample(
         payload=_payload(name, fits, environment, size, image_size, lobes),
         scene=sample_scene(),
         texel_map=texel_map,
+        irradiance_map=texel_map,
         irradiance=irradiance,
         lobes=lobe_maps,
         metrics=metrics,

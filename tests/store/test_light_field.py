@@ -25,6 +25,9 @@ from kiln_workers.store.light_field import LightFieldStore
 R, TILE, SHAPE = 16, 8, (20, 24)
 PLACE = Tile(row=8, column=16, size=TILE, texels=4)
 COVERED = np.array([0, 3, 17, 63])
+SCALE = 3
+FINE = np.array([0, 3 * SCALE * TILE + 5, (SCALE * TILE) ** 2 - 1])
+"""Row-major in the tile of the finer map."""
 
 
 def make(url: str, **changes: object) -> LightFieldStore:
@@ -47,6 +50,8 @@ def images(count: int, seed: int = 0) -> np.ndarray:
 def fill(store: LightFieldStore, seed: int = 0) -> None:
     irradiance = np.arange(12, dtype=np.float32).reshape(4, 3)
     store.write_tile(PLACE, COVERED, images(4, seed), images(4, seed + 1), irradiance)
+    if store.irradiance_scale > 1:
+        store.write_fine_irradiance(PLACE, FINE, np.arange(12, 21, dtype=np.float32).reshape(3, 3))
 
 
 @pytest.fixture
@@ -71,6 +76,18 @@ def test_reads_back_what_was_written(url: str) -> None:
         np.testing.assert_array_equal(store.read_tile(function, PLACE, COVERED[[2, 0]]), images(4, seed)[[2, 0]])
     assert store.read_irradiance([PLACE])[8 + 2, 16 + 1].tolist() == [6.0, 7.0, 8.0]  # 17 = row 2, column 1
     assert store.read_irradiance([PLACE]).sum() == np.arange(12).sum()
+
+
+def test_the_finer_irradiance_has_its_own_grid(url: str) -> None:
+    fill(make(url, irradiance_scale=SCALE))
+    found = LightFieldStore.open(url).read_fine_irradiance([PLACE])
+    assert found.shape == (SCALE * SHAPE[0], SCALE * SHAPE[1], 3)
+    top, left = SCALE * PLACE.row, SCALE * PLACE.column
+    assert found[top, left].tolist() == [12.0, 13.0, 14.0]
+    assert found[top + 3, left + 5].tolist() == [15.0, 16.0, 17.0]
+    assert found[top + SCALE * TILE - 1, left + SCALE * TILE - 1].tolist() == [18.0, 19.0, 20.0]
+    assert found.sum() == np.arange(12, 21).sum()
+    assert np.asarray(zarr.open_group(folder(url), mode="r")["fine_irradiance"]).sum() == found.sum()  # type: ignore[arg-type]
 
 
 def test_stock_zarr_python_reads_the_same_and_sees_absent_chunks(url: str) -> None:
@@ -152,13 +169,17 @@ SHARDS = {
     "visibility": "visibility/c/1/2/0/0/0",
     "between": "between/c/1/2/0/0/0/0",
     "irradiance": "irradiance/c/1/2/0",
+    "fine_irradiance": "fine_irradiance/c/1/2/0",
 }
+WITHOUT_IMAGES = ("irradiance", "fine_irradiance")
 
 
 def read(store: LightFieldStore, array: str) -> npt.NDArray[Any]:
     """What a tile has in one of the arrays."""
     if array == "irradiance":
         return store.read_irradiance([PLACE])
+    if array == "fine_irradiance":
+        return store.read_fine_irradiance([PLACE])
     return (
         store.read_between(PLACE, COVERED) if array == "between" else store.read_tile(Function(array), PLACE, COVERED)
     )
@@ -166,13 +187,17 @@ def read(store: LightFieldStore, array: str) -> npt.NDArray[Any]:
 
 @pytest.mark.parametrize("array", SHARDS)
 def test_one_wrong_byte_anywhere_is_found_and_so_is_a_cut_or_lost_object(url: str, array: str) -> None:
-    store = make(url, between=True)
+    store = make(url, between=True, irradiance_scale=SCALE)
     fill(store)
     store.write_between(PLACE, COVERED, np.ones((4, 3, R // 2, R // 2, 3), np.float16))
     good = read(store, array)
     shard = folder(url) / SHARDS[array]
     data = shard.read_bytes()
-    stored = [range(len(data))] if array == "irradiance" else [range(40), range(len(data) // 2, len(data), 7)]
+    stored = (
+        [range(0, len(data), 1 + len(data) // 500)]
+        if array in WITHOUT_IMAGES
+        else [range(40), range(len(data) // 2, len(data), 7)]
+    )
     for place in chain(*stored):
         shard.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
         with pytest.raises(TilesLost, match=f"{array} of tile 8,16") as caught:
@@ -191,7 +216,7 @@ def test_one_wrong_byte_anywhere_is_found_and_so_is_a_cut_or_lost_object(url: st
 
 @pytest.mark.parametrize("array", SHARDS)
 def test_a_damaged_tile_is_replaced_when_it_is_written_again(url: str, array: str) -> None:
-    store = make(url, between=True)
+    store = make(url, between=True, irradiance_scale=SCALE)
     between = np.ones((4, 3, R // 2, R // 2, 3), np.float16)
     fill(store)
     store.write_between(PLACE, COVERED, between)

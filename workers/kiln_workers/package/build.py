@@ -95,6 +95,8 @@ class PackageInput:
     payload: PackagePayload
     scene: Scene
     texel_map: TexelMapLike
+    irradiance_map: TexelMapLike
+    """The texels of the irradiance map: the light map's own, or finer ones."""
     irradiance: Float32  # [H, W, 3] radiance times sr; anything outside valid texels
     lobes: Mapping[Function, LobeMap]
     metrics: Mapping[Function, FitMetrics]
@@ -159,11 +161,11 @@ def build_package(folder: Path, given: PackageInput, judge: Judge | None = None)
     _check(given)
     package = _Package(folder, given)
     (folder / MANIFEST_JSON).unlink(missing_ok=True)
-    valid = given.texel_map.state == TEXEL_VALID
+    valid = given.irradiance_map.state == TEXEL_VALID
     for function, lobe_map in given.lobes.items():
         fill = plan_fill(lobe_map.mask, given.texel_map.chart)
         _write_lobes(package, function, lobe_map, fill, Stitcher(given.scene, fill))
-    fill = plan_fill(valid, given.texel_map.chart)
+    fill = plan_fill(valid, given.irradiance_map.chart)
     irradiance = np.maximum(Stitcher(given.scene, fill).stitch(fill.smooth(given.irradiance)), 0.0)
     _write_irradiance(package, irradiance)
     _write_errors(package)
@@ -197,8 +199,9 @@ def build_package(folder: Path, given: PackageInput, judge: Judge | None = None)
 def _check(given: PackageInput) -> None:
     """Arrays that contradict each other are a defect of the caller; say which before anything is written."""
     shape = given.texel_map.state.shape
-    if given.irradiance.shape != (*shape, 3):
-        raise InternalError(f"irradiance is {given.irradiance.shape}, the light map {shape}", where="package")
+    if given.irradiance.shape != (*given.irradiance_map.state.shape, 3):
+        expected = given.irradiance_map.state.shape
+        raise InternalError(f"irradiance is {given.irradiance.shape}, its map {expected}", where="package")
     fitted = {fit.function for fit in given.payload.fits}
     for function, lobe_map in given.lobes.items():
         if lobe_map.lobes.shape[:2] != shape or lobe_map.mask.shape != shape:
@@ -207,7 +210,7 @@ def _check(given: PackageInput) -> None:
             raise InternalError("lobes without metrics or without a fit", where=str(function))
         if not np.isfinite(lobe_map.lobes[lobe_map.mask]).all():
             raise InternalError("lobes that are not finite", where=str(function))
-    if not np.isfinite(given.irradiance[given.texel_map.state == TEXEL_VALID]).all():
+    if not np.isfinite(given.irradiance[given.irradiance_map.state == TEXEL_VALID]).all():
         raise InternalError("irradiance that is not finite", where="package")
 
 

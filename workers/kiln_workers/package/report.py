@@ -40,6 +40,9 @@ _GRADES: Final = (
 """Upper bounds of log_mse_rel, the word for it and its style; from 0.5 on a bake fails (kiln_workers.fit)."""
 
 
+LARGEST_MAP: Final = 1024
+"""Pixels along a side of the irradiance map that the report shows, at most."""
+
 _PICTURE_GRADES: Final = (
     (0.02, "like the reference", "good"),
     (0.06, "close to the reference", "good"),
@@ -197,7 +200,9 @@ def _stages(stage_seconds: Mapping[str, float]) -> list[dict[str, Any]]:
 
 
 def _irradiance_picture(irradiance: Float32, covered: npt.NDArray[np.bool_]) -> UInt8:
-    """Irradiance as display colours; gutters show what they were filled with, dimmed."""
+    """Irradiance as display colours; gutters show what they were filled with, dimmed. Large maps are thinned out."""
+    stride = -(-max(covered.shape) // LARGEST_MAP)
+    irradiance, covered = irradiance[::stride, ::stride], covered[::stride, ::stride]
     picture = colour.tone_map(irradiance, colour.white_point(irradiance[covered]))
     alpha = np.where(covered, 255, 96).astype(np.uint8)[..., None]
     return np.concatenate([picture, alpha], axis=-1)

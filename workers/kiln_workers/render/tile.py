@@ -38,6 +38,10 @@ IRRADIANCE_BLOCK: Final = 16
 """Irradiance samples per lane: few, so that the few texels of a tile fill many lanes."""
 
 
+INSIDE_GEOMETRY: Final = -1.0
+"""What a finer irradiance map holds where a point lies inside something."""
+
+
 @dataclass(frozen=True)
 class TexelBatch:
     """T surface points to be baked."""
@@ -193,6 +197,14 @@ class TileRenderer:
             dropped += int(np.array(paths.dropped).sum())
             on_progress(fraction)
         return (total.sum(axis=1) / samples).astype(np.float32), len(texels) * samples, dropped
+
+    def render_fine_irradiance(self, texels: TexelBatch, on_progress: Progress = silent) -> tuple[Float32, int, int]:
+        """The same of a finer map's texels: -1 where no light reaches a point and it lies inside something."""
+        irradiance, paths, dropped = self.render_irradiance(texels, on_progress)
+        dark = np.flatnonzero(~irradiance.any(axis=1))
+        inside = enclosure.enclosed(self.tracer, _origins(texels)[dark], texels.normal[dark])
+        irradiance[dark[inside]] = INSIDE_GEOMETRY
+        return irradiance, paths, dropped
 
     def _trace_irradiance(self, texels: TexelBatch, texel: Int64, block: Int64, counts: Int64) -> tuple[LaneSums, Any]:
         """One wavefront of blocks of irradiance samples: cosine-distributed paths, and next-event estimates."""

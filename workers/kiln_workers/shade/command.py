@@ -48,7 +48,7 @@ def run_shade(options: argparse.Namespace) -> int:
     began = time.perf_counter()
     cuda = select_variant(options.device).startswith("cuda")
     package = ShadePackage.read(options.package, torch.device("cuda" if cuda else "cpu"))
-    shape = (package.irradiance.shape[0], package.irradiance.shape[1])
+    shape = (package.lobes.light_field.shape[0], package.lobes.light_field.shape[1])
     stored = None if options.stored is None else StoredImages.open(store_url(options.stored), shape)
     buffer = render_gbuffer(package.scene, camera, width, height, options.grid, options.device)
     picture = shade(package, buffer, terms, stored, options.paper)

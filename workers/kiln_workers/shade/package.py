@@ -138,7 +138,7 @@ class ShadePackage:
         return cls(
             manifest=manifest,
             scene=scene,
-            irradiance=torch.from_numpy(read_exr(folder / IRRADIANCE_EXR, _texels(manifest))).to(device),
+            irradiance=torch.from_numpy(read_exr(folder / IRRADIANCE_EXR, _irradiance_texels(manifest))).to(device),
             lobes=LobeTextures(_lobes(folder, LIGHT_FIELD_KTX2, manifest, device), visible),
             environment=_environment(folder, manifest, device),
         )
@@ -210,6 +210,11 @@ def _texels(manifest: Manifest) -> int:
     if lightmap.resolution == AUTO and not isinstance(width, int):
         raise InputError("does not say how wide the light map is", where=MANIFEST_JSON, remedy="Bake it again.")
     return min(lightmap.side(width), LARGEST_SIDE) ** 2
+
+
+def _irradiance_texels(manifest: Manifest) -> int:
+    """Texels of the irradiance map, at most."""
+    return min(_texels(manifest) * manifest.settings.lightmap.irradiance_scale**2, LARGEST_SIDE**2)
 
 
 def _lobes(folder: Path, name: str, manifest: Manifest, device: torch.device) -> Tensor:

@@ -33,7 +33,7 @@ from kiln_workers.sphere.octahedral import pixel_directions
 from kiln_workers.stages.bundle import lay_out
 from kiln_workers.stages.gates import GateJudge
 from kiln_workers.stages.refine import read_lobes
-from kiln_workers.stages.tiles import map_coordinates, with_render_verdict
+from kiln_workers.stages.tiles import map_coordinates, with_render_verdict, without_texels
 from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
 from kiln_workers.store.light_field import LightFieldStore
 
@@ -61,7 +61,7 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
     tiles = tuple(sorted((render.tile for render in payload.renders), key=lambda tile: (tile.row, tile.column)))
 
     steps = len(payload.fits) + 2
-    irradiance = store.read_irradiance(tiles)
+    irradiance_map, irradiance = _irradiance(payload, store, texel_map, tiles, context)
     covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles}
     lobes: dict[Function, LobeMap] = {}
     metrics: dict[Function, FitMetrics] = {}
@@ -93,6 +93,7 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
             payload=payload,
             scene=scene,
             texel_map=texel_map,
+            irradiance_map=irradiance_map,
             irradiance=irradiance,
             lobes=lobes,
             metrics=metrics,
@@ -108,6 +109,17 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
     for artifact in artifacts:
         context.put_blob(folder / artifact.name)
     return PackageResult(artifacts=tuple(artifacts), gates=judge.results, seconds=time.perf_counter() - began)
+
+
+def _irradiance(
+    payload: PackagePayload, store: LightFieldStore, texel_map: TexelMap, tiles: Sequence[Tile], context: Context
+) -> tuple[TexelMap, Float32]:
+    """The irradiance map's texels and values [H, W, 3]: the finer ones where the bake has rendered them."""
+    if payload.prepare.fine is None:
+        return texel_map, store.read_irradiance(tiles)
+    finer = unpack_texel_map(context.blob(payload.prepare.fine))
+    irradiance = store.read_fine_irradiance(tiles)
+    return without_texels(finer, np.asarray((irradiance < 0.0).any(axis=2))), np.maximum(irradiance, 0.0)
 
 
 def _original(payload: PackagePayload, scene: Scene, context: Context) -> bytes | None:

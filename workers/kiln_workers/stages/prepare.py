@@ -73,6 +73,8 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         )
     step(4)
     between = between_maps(scene, texel_map) if traces_between(settings) else ()
+    fine_side = settings.lightmap.irradiance_side(lightmap.resolution)
+    fine = build_texel_map(scene, fine_side) if fine_side > lightmap.resolution else None
     step(5)
     digest = scene_hash(scene, settings.render)
     _create_store(payload.store_url, scene, texel_map, digest, settings)
@@ -81,6 +83,7 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         scene=context.put_blob(pack_scene(scene)),
         texel_map=context.put_blob(pack_texel_map(texel_map)),
         between=tuple(context.put_blob(pack_texel_map(moved)) for moved in between),
+        fine=None if fine is None else context.put_blob(pack_texel_map(fine)),
         scene_hash=digest,
         resolution=lightmap.resolution,
         placements=lightmap.placements[:MOST_PLACEMENTS],
@@ -117,6 +120,7 @@ def _coarse_note(texel_map: TexelMap) -> list[str]:
 
 
 def _create_store(url: str, scene: Scene, texel_map: TexelMap, digest: str, settings: BakeSettings) -> None:
+    side = texel_map.state.shape[0]
     store = LightFieldStore.create(
         url,
         shape=(texel_map.state.shape[0], texel_map.state.shape[1]),
@@ -124,6 +128,7 @@ def _create_store(url: str, scene: Scene, texel_map: TexelMap, digest: str, sett
         tile=settings.lightmap.tile,
         functions=[Function.LIGHT_FIELD] + ([Function.VISIBILITY] if scene.environment else []),
         between=traces_between(settings),
+        irradiance_scale=settings.lightmap.irradiance_side(side) // side,
         attributes={"scene_hash": digest, "settings": settings.model_dump(mode="json")},
     )
     store.write_texel_map({name: getattr(texel_map, name) for name in TEXEL_MAP_ARRAYS})

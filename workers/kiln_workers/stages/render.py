@@ -15,13 +15,16 @@ from kiln_workers.render.tile import TexelBatch, TileRenderer
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import unpack_scene
 from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
-from kiln_workers.stages.tiles import covered_texels, map_coordinates
+from kiln_workers.stages.tiles import covered_finer, covered_texels, map_coordinates
 from kiln_workers.store.light_field import LightFieldStore
 
 Float16 = npt.NDArray[np.float16]
 Ints = npt.NDArray[np.int64]
 
 _WARM: Final = "render"
+
+FINE_SEQUENCE: Final = 16
+"""The finer irradiance's random numbers begin after those of the texels and of all points between."""
 
 BETWEEN_SHARE: Final = 0.2
 """About what the light fields between texels take of a tile's time: three points a texel, a quarter of the pixels."""
@@ -48,6 +51,8 @@ def run(payload: RenderPayload, context: Context) -> RenderResult:
         between, more = _trace_between(warm, payload, place, lambda done: on_progress(share + (1.0 - share) * done))
         warm.store.write_between(tile, inside, between)
         paths += more
+    if warm.fine is not None:
+        paths += _render_fine(warm, warm.fine, payload)
     warm.store.check()
     invalid = inside[images.enclosed]
     return RenderResult(
@@ -58,6 +63,15 @@ def run(payload: RenderPayload, context: Context) -> RenderResult:
         invalid_texels=tuple(invalid.tolist()),
         seconds=time.perf_counter() - began,
     )
+
+
+def _render_fine(warm: "_Warm", fine: TexelMap, payload: RenderPayload) -> int:
+    """Write the tile's part of the finer irradiance map; how many paths it took."""
+    inside, place = covered_finer(fine, payload.tile, warm.store.irradiance_scale)
+    batch = TexelBatch.of(fine, place, FINE_SEQUENCE * warm.texel_map.state.size)
+    irradiance, paths, _ = warm.renderer.render_fine_irradiance(batch)
+    warm.store.write_fine_irradiance(payload.tile, inside, irradiance)
+    return paths
 
 
 def _trace_between(
@@ -89,11 +103,12 @@ class _Warm:
     renderer: TileRenderer
     texel_map: TexelMap
     between: tuple[TexelMap, ...]
+    fine: TexelMap | None
     store: LightFieldStore
 
 
 def _warm(payload: RenderPayload, context: Context) -> _Warm:
-    key = (payload.scene, payload.texel_map, payload.between, payload.store_url, payload.settings.render)
+    key = (payload.scene, payload.texel_map, payload.between, payload.fine, payload.store_url, payload.settings.render)
     warm = context.cache.get(_WARM)
     if not isinstance(warm, _Warm) or warm.key != key:
         context.cache.pop(_WARM, None)
@@ -102,6 +117,7 @@ def _warm(payload: RenderPayload, context: Context) -> _Warm:
         scene = unpack_scene(context.blob(payload.scene))
         renderer = TileRenderer(scene, store.attributes["scene_hash"], payload.settings.render, context.memory_bytes)
         between = tuple(unpack_texel_map(context.blob(digest)) for digest in payload.between)
-        warm = _Warm(key, renderer, unpack_texel_map(context.blob(payload.texel_map)), between, store)
+        fine = None if payload.fine is None else unpack_texel_map(context.blob(payload.fine))
+        warm = _Warm(key, renderer, unpack_texel_map(context.blob(payload.texel_map)), between, fine, store)
         context.cache[_WARM] = warm
     return warm

@@ -31,6 +31,17 @@ def covered_texels(texel_map: TexelMap, tile: Tile) -> Ints:
     return np.asarray(rows * tile.size + columns, dtype=np.int64)
 
 
+def covered_finer(finer: TexelMap, tile: Tile, scale: int) -> tuple[Ints, tuple[Ints, Ints]]:
+    """Texels of a map with `scale` texels along each side of a texel that lie in a tile and have a surface point.
+
+    Row-major indices inside the tile's finer square [T], ascending; rows and columns in the finer map.
+    """
+    row, column, size = scale * tile.row, scale * tile.column, scale * tile.size
+    part = finer.state[row : row + size, column : column + size]
+    rows, columns = (np.asarray(place, dtype=np.int64) for place in np.nonzero(part != TexelState.GUTTER))
+    return rows * size + columns, (rows + row, columns + column)
+
+
 def map_coordinates(tile: Tile, inside: Ints) -> tuple[Ints, Ints]:
     """Rows and columns in the light map of row-major indices inside a tile."""
     rows, columns = np.divmod(inside, tile.size)
@@ -42,9 +53,16 @@ def with_render_verdict(texel_map: TexelMap, renders: Iterable[RenderResult]) ->
 
     A chart that lies inside as a whole has nothing to be filled from: it stays as it is.
     """
-    state = texel_map.state.copy()
+    inside = np.zeros(texel_map.state.shape, bool)
     for render in renders:
-        state[map_coordinates(render.tile, np.asarray(render.invalid_texels, dtype=np.int64))] = TexelState.INVALID
+        inside[map_coordinates(render.tile, np.asarray(render.invalid_texels, dtype=np.int64))] = True
+    return without_texels(texel_map, inside)
+
+
+def without_texels(texel_map: TexelMap, inside: npt.NDArray[np.bool_]) -> TexelMap:
+    """The texel map with the texels `inside` [H, W] geometry marked invalid, except for charts that wholly are."""
+    state = texel_map.state.copy()
+    state[inside] = TexelState.INVALID
     somewhere = np.unique(texel_map.chart[state == TexelState.VALID])
     state[(state == TexelState.INVALID) & ~np.isin(texel_map.chart, somewhere)] = TexelState.VALID
     return replace(texel_map, state=state)

@@ -60,6 +60,10 @@ CONVENTIONS: Final[Mapping[str, str]] = {
         "different charts are zero."
     ),
     "irradiance": "Over the hemisphere of the texel's shading normal, direct and indirect, environment included.",
+    "fine_irradiance": (
+        "The same over the light map with `irradiance_scale` texels along each side of a texel, -1 where the point "
+        "lies inside geometry. Only in stores with an `irradiance_scale` over 1."
+    ),
     "exposure": (
         "Values here are not exposure-normalised. The fit multiplies radiance by EXPOSURE_KEY / (mean luminance above "
         "the horizons, solid-angle-weighted) and undoes it in the amplitudes; the factor is in the bake's manifest."
@@ -86,6 +90,7 @@ def group_attributes(
     tile: int,
     functions: Sequence[Function],
     between: bool,
+    irradiance_scale: int,
     extra: Mapping[str, Any],
 ) -> dict[str, Any]:
     """What the group says of itself: layout, conventions and what the caller adds (settings, scene hash, ...)."""
@@ -98,6 +103,7 @@ def group_attributes(
         "tile": tile,
         "functions": [function.value for function in functions],
         "between": between,
+        "irradiance_scale": irradiance_scale,
         "exposure_key": conventions.EXPOSURE_KEY,
         "conventions": dict(CONVENTIONS),
     }

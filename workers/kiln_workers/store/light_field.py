@@ -48,6 +48,7 @@ class LightFieldStore:
         self.image_size: Final = int(attributes["image_size"])
         self.tile_size: Final = int(attributes["tile"])
         self.has_between: Final = bool(attributes.get("between", False))
+        self.irradiance_scale: Final = int(attributes.get("irradiance_scale", 1))
         self.functions: Final = tuple(Function(name) for name in attributes["functions"])
         self._context = ts.Context({"data_copy_concurrency": {"limit": 2}, "file_io_concurrency": {"limit": 8}})
         self._arrays: dict[str, Any] = {}
@@ -63,6 +64,7 @@ class LightFieldStore:
         functions: Sequence[Function],
         attributes: Mapping[str, Any],
         between: bool = False,
+        irradiance_scale: int = 1,
     ) -> Self:
         """Make the store, or open it where an identical one lies there; Conflict where a different one does.
 
@@ -71,7 +73,8 @@ class LightFieldStore:
         `attributes` (settings, scene hash, ...) must be JSON. The group document is written last, so a
         store that opens is whole.
         """
-        mine = json.loads(json.dumps(layout.group_attributes(shape, image_size, tile, functions, between, attributes)))
+        described = layout.group_attributes(shape, image_size, tile, functions, between, irradiance_scale, attributes)
+        mine = json.loads(json.dumps(described))
         try:
             found = _read_group(url)
         except StoreLost:
@@ -169,6 +172,11 @@ class LightFieldStore:
             self._write_texels(function.value, tile, covered, values)
         self._write_texels(conventions.ARRAY_IRRADIANCE, tile, covered, irradiance.astype(np.float32, copy=False))
 
+    def write_fine_irradiance(self, tile: Tile, covered: Index, irradiance: Float32) -> None:
+        """Replace a tile's finer irradiance [T, 3], -1 inside geometry; `covered` [T] row-major in the finer tile."""
+        self._refuse_not_finite(irradiance, conventions.ARRAY_FINE_IRRADIANCE)
+        self._write_texels(conventions.ARRAY_FINE_IRRADIANCE, tile, covered, irradiance.astype(np.float32, copy=False))
+
     def write_between(self, tile: Tile, texels: Index, images: Float16) -> None:
         """Replace a tile's sparse light fields between texels: row-major `texels` [B], images [B, 3, R/2, R/2, 3]."""
         self._refuse_not_finite(images, conventions.ARRAY_BETWEEN)
@@ -194,18 +202,30 @@ class LightFieldStore:
 
     def read_irradiance(self, tiles: Iterable[Tile]) -> Float32:
         """Irradiance [H, W, 3] of tiles, zero elsewhere; TilesLost where one of them is not there."""
-        array = self._array(conventions.ARRAY_IRRADIANCE)
-        out, lost = np.zeros((*self.shape, 3), np.float32), []
+        return self._read_map(conventions.ARRAY_IRRADIANCE, tiles)
+
+    def read_fine_irradiance(self, tiles: Iterable[Tile]) -> Float32:
+        """The same of the finer map [S H, S W, 3], S = `irradiance_scale`; -1 where a point lies inside geometry."""
+        return self._read_map(conventions.ARRAY_FINE_IRRADIANCE, tiles)
+
+    def _read_map(self, name: str, tiles: Iterable[Tile]) -> Float32:
+        array, scale = self._array(name), self._scale(name)
+        height, width = (scale * side for side in self.shape)
+        out, lost = np.zeros((height, width, 3), np.float32), []
         for tile in tiles:
-            rows = slice(tile.row, min(tile.row + tile.size, self.shape[0]))
-            columns = slice(tile.column, min(tile.column + tile.size, self.shape[1]))
+            row, column, size = (scale * number for number in (tile.row, tile.column, tile.size))
+            rows, columns = slice(row, min(row + size, height)), slice(column, min(column + size, width))
             try:
-                out[rows, columns] = self._stored(conventions.ARRAY_IRRADIANCE, tile, array[rows, columns])
+                out[rows, columns] = self._stored(name, tile, array[rows, columns])
             except TilesLost:
                 lost.append(tile)
         if lost:
-            raise self._lost(conventions.ARRAY_IRRADIANCE, lost, "are gone or damaged")
+            raise self._lost(name, lost, "are gone or damaged")
         return out
+
+    def _scale(self, name: str) -> int:
+        """Texels of an array along each side of a texel."""
+        return self.irradiance_scale if name == conventions.ARRAY_FINE_IRRADIANCE else 1
 
     def lost_tiles(self, names: Iterable[str], tiles: Mapping[Tile, Index]) -> list[Tile]:
         """Those of the tiles, each with its covered texels [T], that cannot be read from all of these arrays."""
@@ -219,7 +239,7 @@ class LightFieldStore:
         return lost
 
     def _read_texels(self, name: str, tile: Tile, covered: Index) -> Float16:
-        rows, columns = self._positions(tile, covered)
+        rows, columns = self._positions(tile, covered, self._scale(name))
         values: Float16 = self._stored(name, tile, self._array(name)[rows, columns])
         # A texel that was never written is zero in all its bits, as is a black one: only of those the store is asked.
         zero = ~values.reshape(len(values), -1).view(np.uint8).any(axis=1)
@@ -254,7 +274,7 @@ class LightFieldStore:
         write_patiently(self.url, lambda: array[...].write(values).result())
 
     def _write_texels(self, name: str, tile: Tile, covered: Index, values: npt.NDArray[Any]) -> None:
-        rows, columns = self._positions(tile, covered)
+        rows, columns = self._positions(tile, covered, self._scale(name))
         array = self._array(name)
 
         def write() -> None:
@@ -275,13 +295,13 @@ class LightFieldStore:
 
         write_patiently(self.url, write_anew)
 
-    def _positions(self, tile: Tile, covered: Index) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    def _positions(self, tile: Tile, covered: Index, scale: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         aligned = tile.row % self.tile_size == 0 and tile.column % self.tile_size == 0 and tile.size == self.tile_size
         if not aligned:
             raise InternalError(f"tile {tile} does not lie on the store's grid of {self.tile_size}")
-        rows, columns = np.divmod(np.asarray(covered, dtype=np.int64), tile.size)
-        rows, columns = rows + tile.row, columns + tile.column
-        if len(rows) and (rows.max() >= self.shape[0] or columns.max() >= self.shape[1]):
+        rows, columns = np.divmod(np.asarray(covered, dtype=np.int64), scale * tile.size)
+        rows, columns = rows + scale * tile.row, columns + scale * tile.column
+        if len(rows) and (rows.max() >= scale * self.shape[0] or columns.max() >= scale * self.shape[1]):
             raise InternalError(f"tile {tile} has texels outside of the light map {self.shape}")
         return rows, columns
 
@@ -290,6 +310,9 @@ class LightFieldStore:
         if self.has_between:
             out[conventions.ARRAY_BETWEEN] = layout.between_metadata(self.shape, self.image_size, self.tile_size)
         out[conventions.ARRAY_IRRADIANCE] = layout.irradiance_metadata(self.shape, self.tile_size)
+        if (scale := self.irradiance_scale) > 1:
+            finer = (scale * self.shape[0], scale * self.shape[1])
+            out[conventions.ARRAY_FINE_IRRADIANCE] = layout.irradiance_metadata(finer, scale * self.tile_size)
         return out | {name: layout.texel_map_metadata(name, self.shape) for name in layout.TEXEL_MAP_ARRAYS}
 
     def _array(self, name: str) -> Any:
