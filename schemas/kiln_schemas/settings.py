@@ -139,7 +139,7 @@ class FitSettings(Contract):
     solver: Solver = Solver.COHERENT
     lobes: int = Field(ge=1, le=64, description="spherical Gaussians per texel")
     steps: int = Field(ge=1, le=1_000_000, description="optimiser steps of the light field's network, used as it is")
-    start_steps: int = Field(default=800, ge=1, le=1_000_000, description="the same where the coherent descent follows")
+    start_steps: int = Field(default=100, ge=1, le=1_000_000, description="the same where the coherent descent follows")
     visibility_steps: int = Field(default=1000, ge=1, le=1_000_000, description="of the visibility's: it is far easier")
     batch: int = Field(default=32, ge=1, le=1024, description="texels per step")
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
@@ -199,20 +199,20 @@ PRESETS: Final[Mapping[str, BakeSettings]] = {
         preset="draft",
         lightmap=LightmapSettings(density=1.4, least=32, most=128, irradiance_scale=4, tile=8),
         render=RenderSettings(image_size=32, samples=32, irradiance_samples=512),
-        fit=FitSettings(lobes=8, steps=1000, start_steps=500, visibility_steps=500),
+        fit=FitSettings(lobes=8, steps=1000, visibility_steps=250),
         package=PackageSettings(environment_size=64),
     ),
     "preview": BakeSettings(
         preset="preview",
         lightmap=LightmapSettings(density=2.8, least=64, most=256, irradiance_scale=4),
         render=RenderSettings(image_size=64, samples=128),
-        fit=FitSettings(lobes=16, steps=2500),
+        fit=FitSettings(lobes=16, steps=2500, visibility_steps=300),
     ),
     "production": BakeSettings(
         preset="production",
         lightmap=LightmapSettings(density=22.0, least=512, most=1024, irradiance_scale=2),
         render=RenderSettings(image_size=128, samples=128, irradiance_samples=4096, max_depth=8),
-        fit=FitSettings(lobes=16, steps=60_000, start_steps=20_000, visibility_steps=24_000),
+        fit=FitSettings(lobes=16, steps=60_000, start_steps=1000, visibility_steps=24_000),
         package=PackageSettings(environment_size=256),
     ),
 }

@@ -18,7 +18,8 @@ from kiln_workers.fit.metrics import exposure_of, texel_errors
 from kiln_workers.fit.network import Shape, initial_parameters
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.source import ArraySource
-from kiln_workers.fit.train import _failure, train
+from kiln_workers.fit.train import train
+from kiln_workers.fit.verdict import failure, is_negligible
 from kiln_workers.sphere import gaussian, octahedral
 
 SHORT = FitSettings(lobes=4, steps=40, batch=10, window=24)
@@ -102,11 +103,11 @@ def test_the_remedy_of_a_failure_fits_its_cause() -> None:
 
     def remedy(texels: int, signal: float) -> str:
         errors = SimpleNamespace(error=np.ones(texels), log_mse=signal, log_mse_zero=signal, log_mse_rel=1.0)
-        return _failure(errors, LIGHT, SHORT).remedy or ""  # type: ignore[arg-type]
+        return failure(errors, LIGHT, "steps", 40, 4).remedy or ""  # type: ignore[arg-type]
 
     assert remedy(3, 1.0).startswith("Only 3 texels of the light map can be fitted: raise lightmap.resolution")
     assert remedy(500, 1e-9).startswith("Hardly any light reaches the surfaces")
-    assert remedy(500, 1.0).startswith("Raise fit.")
+    assert remedy(500, 1.0).startswith("Raise fit.steps (now 40) or fit.lobes (now 4)")
 
 
 def test_darkness_is_no_failure(lobe_source: ArraySource) -> None:
@@ -120,14 +121,22 @@ def test_darkness_is_no_failure(lobe_source: ArraySource) -> None:
 
 def test_a_fit_that_collapses_on_what_nobody_would_see_is_left_out(lobe_source: ArraySource) -> None:
     settings = FitSettings(lobes=4, steps=40, batch=10, learning_rate=1.0)
-    mean = EXPOSURE_KEY / exposure_of(lobe_source, LIGHT)
+    received = np.full((3, 3), np.pi * EXPOSURE_KEY / exposure_of(lobe_source, LIGHT), np.float32)
     with pytest.raises(FitFailed):
-        train(lobe_source, settings, LIGHT, 0, least_radiance=lambda: 0.99 * mean)
-    outcome = train(lobe_source, settings, LIGHT, 0, least_radiance=lambda: 1.01 * mean)
+        train(lobe_source, settings, LIGHT, 0, is_negligible=lambda exposure: is_negligible(exposure, 99.0 * received))
+    outcome = train(
+        lobe_source, settings, LIGHT, 0, is_negligible=lambda exposure: is_negligible(exposure, 101.0 * received)
+    )
     assert not outcome.metrics.signal and outcome.metrics.log_mse == outcome.metrics.log_mse_zero > 0.0
     lobes = predict(outcome.weights, lobe_source._images[:3], lobe_source._normals[:3])
     assert (lobes[..., 4:] == 0.0).all()
-    assert train(lobe_source, SHORT, LIGHT, 0, least_radiance=lambda: 1e9).metrics.signal, "what can be fitted is"
+    assert train(lobe_source, SHORT, LIGHT, 0, is_negligible=lambda _: True).metrics.signal, "what can be fitted is"
+
+
+def test_what_a_descent_starts_from_is_not_judged(lobe_source: ArraySource) -> None:
+    settings = FitSettings(lobes=4, steps=40, batch=10, learning_rate=1.0)
+    outcome = train(lobe_source, settings, LIGHT, 0, is_start=True)
+    assert outcome.metrics.signal and outcome.metrics.log_mse_rel > 0.5
 
 
 def test_no_valid_texel_is_an_error() -> None:

@@ -15,13 +15,14 @@ from e2e_farm import TINY, room, sky
 from in_process import Baked, MemoryContext, bake
 
 from kiln_schemas.camera import Camera
-from kiln_schemas.errors import Canceled, InputError
+from kiln_schemas.errors import Canceled, FitFailed, InputError
 from kiln_schemas.gates import Gates
 from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import Function, make_settings
 from kiln_schemas.tasks import (
     Bundle,
     PackagePayload,
+    RefineResult,
 )
 from kiln_workers.fit.metrics import TexelErrors, texel_errors
 from kiln_workers.fit.predict import Weights, predict
@@ -31,6 +32,7 @@ from kiln_workers.package.gates import Judgement
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.package.half import layers_to_lobes
 from kiln_workers.scene.archive import unpack_scene
+from kiln_workers.scene.container import pack, unpack
 from kiln_workers.scene.model import Environment
 from kiln_workers.scene.texel_map import TexelState, unpack_texel_map
 from kiln_workers.shade.first_camera import first_camera
@@ -39,7 +41,7 @@ from kiln_workers.shade.image_metrics import flip
 from kiln_workers.shade.package import ShadePackage, read_manifest
 from kiln_workers.shade.picture import shade
 from kiln_workers.shade.reference import path_trace
-from kiln_workers.stages import gates, prepare, refine, render
+from kiln_workers.stages import gates, package, prepare, refine, render
 from kiln_workers.stages.tiles import covered_texels, map_coordinates, plan_tiles, with_render_verdict
 from kiln_workers.store.layout import BETWEEN_STEPS
 from kiln_workers.store.light_field import LightFieldStore
@@ -102,6 +104,42 @@ def test_light_field_holds_the_refined_lobes(baked: Baked) -> None:
     manifest = Manifest.model_validate_json(baked.artifact("manifest.json"))
     assert manifest.metrics.light_field is not None
     assert manifest.metrics.light_field.log_mse == pytest.approx(refined, rel=1e-3)
+
+
+def without_light(baked: Baked) -> tuple[RefineResult, ...]:
+    """The refined blocks with lobes that carry no light."""
+    out = []
+    for result in baked.refines:
+        body, arrays = unpack("lobes", baked.context.blob(result.lobes))
+        lobes = arrays["lobes"].copy()
+        lobes[..., 4:] = 0.0
+        blob = baked.context.put_blob(pack("lobes", body, {**arrays, "lobes": lobes}))
+        out.append(result.model_copy(update={"lobes": blob}))
+    return tuple(out)
+
+
+def test_refined_lobes_that_fail_are_refused_or_left_out(
+    baked: Baked, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """FitFailed with the setting to raise; where nobody would see the light field it is left out instead."""
+    payload = payload_of_gates(
+        baked,
+        **{"renders": baked.renders, "fits": baked.fits, "refines": without_light(baked)},
+        store_url=baked.prepare_payload.store_url,
+    )
+    context = MemoryContext(scratch=tmp_path / "failed", blobs=dict(baked.context.blobs))
+    context.scratch.mkdir()
+    with pytest.raises(FitFailed, match="100% of the") as caught:
+        package.run(payload, context)
+    assert "fit.refine_steps (now 60)" in (caught.value.remedy or "")
+
+    bright = np.full((16, 16, 3), 1e6, np.float32)
+    monkeypatch.setattr(LightFieldStore, "read_irradiance", lambda self, tiles: bright)
+    result = package.run(payload, context)
+    (digest,) = (artifact.sha256 for artifact in result.artifacts if artifact.name == "manifest.json")
+    manifest = Manifest.model_validate_json(context.blob(digest))
+    assert manifest.metrics.light_field is not None and not manifest.metrics.light_field.signal
+    assert any("no lobes fit it" in note for note in manifest.notes)
 
 
 def test_refining_a_block_again_gives_the_same_bytes(baked: Baked) -> None:

@@ -18,8 +18,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kiln_schemas.conventions import EXPOSURE_KEY, LOBE_PARAMETERS
-from kiln_schemas.errors import FitFailed, InputError
+from kiln_schemas.conventions import LOBE_PARAMETERS
+from kiln_schemas.errors import InputError
 from kiln_schemas.settings import FitSettings, Function
 from kiln_schemas.tasks import CurvePoint, FitMetrics, Progress
 from kiln_workers.fit.lobes import constrain
@@ -31,13 +31,11 @@ from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.source import Float16, Float32, TexelSource
 from kiln_workers.fit.stream import Batch, TexelStream
 from kiln_workers.fit.threads import single_threaded_pool
+from kiln_workers.fit.verdict import failure, has_failed
 from kiln_workers.scene.container import pack, unpack
 
 MICRO_BATCHES: Final = 4
 CURVE_POINTS: Final = 200
-FAILURE_RATIO: Final = 0.5
-"""A fit whose error is above this fraction of the error of P = 0 has failed."""
-
 NO_SIGNAL: Final = 1e-10
 """log_mse of P = 0 below which there is nothing to fit."""
 
@@ -89,12 +87,13 @@ def train(
     exposure: float | None = None,
     on_epoch: Callable[[int, Weights], None] | None = None,
     start: Weights | None = None,
-    least_radiance: Callable[[], float] = lambda: 0.0,
+    is_negligible: Callable[[float], bool] = lambda exposure: False,
+    is_start: bool = False,
 ) -> FitOutcome:
     """Fit one function; FitFailed where it does not clearly beat P = 0, InputError where there are no texels.
 
-    A function whose mean luminance above the horizon is under `least_radiance` (W/(m^2 sr), asked for where the fit has
-    failed) is left out instead: it is too weak to be seen, and the network finds nothing in it.
+    A function that `is_negligible` at its exposure (asked where the fit has failed) is left out instead: it is too weak
+    to be seen, and the network finds nothing in it. What a descent starts from (`is_start`) is not judged.
 
     `exposure` is that of the source unless given; `on_epoch` is shown the weights after each pass over the texels;
     `start` is a network of the same shape to go on from, instead of random weights.
@@ -139,9 +138,9 @@ def train(
         weights = _weights(shape, state)
         errors = _errors(source, weights, state.exposure, pool)
     metrics = _metrics(errors, signal=True)
-    if _has_failed(errors):
-        if EXPOSURE_KEY / state.exposure >= least_radiance():
-            raise _failure(errors, function, settings)
+    if has_failed(errors) and not is_start:
+        if not is_negligible(state.exposure):
+            raise failure(errors, function, settings.steps_key(function), settings.steps, settings.lobes)
         weights = replace(weights, signal=False)
         metrics = metrics.model_copy(update={"signal": False, "log_mse": errors.log_mse_zero, "log_mse_rel": 1.0})
     return FitOutcome(
@@ -237,35 +236,6 @@ def _metrics(errors: TexelErrors, *, signal: bool) -> FitMetrics:
         texels=len(errors.error),
         signal=signal,
     )
-
-
-FEW_TEXELS: Final = 16
-"""Fewer texels are no map: a network that shares what it learns between texels has nothing to share."""
-DARK: Final = 1e-5
-"""Mean square of the logarithmic signal below which nearly all texels are black."""
-
-
-def _has_failed(errors: TexelErrors) -> bool:
-    return not errors.log_mse_rel <= FAILURE_RATIO  # also true for NaN
-
-
-def _failure(errors: TexelErrors, function: Function, settings: FitSettings) -> FitFailed:
-    return FitFailed(
-        f"the fit of the {function.value} ended at log_mse {errors.log_mse:.4g}, {errors.log_mse_rel:.0%} of the "
-        f"{errors.log_mse_zero:.4g} that no light at all would have (at most {FAILURE_RATIO:.0%} is accepted)",
-        where=f"fit {function.value}",
-        remedy=_remedy(errors, function, settings),
-    )
-
-
-def _remedy(errors: TexelErrors, function: Function, settings: FitSettings) -> str:
-    """What to do about a fit that failed: the light map's size, the scene's light, or the fit itself."""
-    texels = len(errors.error)
-    if texels < FEW_TEXELS:
-        return f"Only {texels} texels of the light map can be fitted: raise lightmap.resolution."
-    if errors.log_mse_zero < DARK:
-        return "Hardly any light reaches the surfaces: check the lights' strength, and to which side its faces look."
-    return f"Raise fit.{settings.steps_key(function)} (now {settings.steps}) or fit.lobes (now {settings.lobes})."
 
 
 def _without_signal(source: TexelSource, shape: Shape, state: _State, seconds: float) -> FitOutcome:

@@ -1,23 +1,15 @@
 """Fit one function: stream the rendered tiles through the network until it is trained."""
 
-from collections.abc import Sequence
-from typing import Final
-
-import numpy as np
-
 from kiln_schemas.conventions import ARRAY_IRRADIANCE
-from kiln_schemas.settings import Function
-from kiln_schemas.tasks import FitPayload, FitResult, Progress, Tile
-from kiln_workers.fit.metrics import LUMINANCE
+from kiln_schemas.settings import Function, Solver
+from kiln_schemas.tasks import FitPayload, FitResult, Progress
 from kiln_workers.fit.source import StoreSource, valid_texels
 from kiln_workers.fit.train import train
+from kiln_workers.fit.verdict import is_negligible
 from kiln_workers.runner.context import Context
-from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
+from kiln_workers.scene.texel_map import TexelState, unpack_texel_map
 from kiln_workers.stages.tiles import with_render_verdict
 from kiln_workers.store.light_field import LightFieldStore
-
-NEGLIGIBLE: Final = 0.01
-"""Of the mean radiance that a light map receives: a light field under it is left out rather than failed for."""
 
 
 def run(payload: FitPayload, context: Context) -> FitResult:
@@ -37,10 +29,11 @@ def run(payload: FitPayload, context: Context) -> FitResult:
     settings = asked.model_copy(update={"steps": getattr(asked, asked.steps_key(payload.function))})
     covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles}
 
-    def least_radiance() -> float:
-        if payload.function is not Function.LIGHT_FIELD:
-            return 0.0
-        return NEGLIGIBLE * _mean_radiance(store, tiles, texel_map)
+    is_light_field = payload.function is Function.LIGHT_FIELD
+
+    def negligible(exposure: float) -> bool:
+        valid = texel_map.state == TexelState.VALID
+        return is_light_field and is_negligible(exposure, store.read_irradiance(tiles)[valid])
 
     with store.all_lost([payload.function.value, ARRAY_IRRADIANCE], covered):
         outcome = train(
@@ -53,7 +46,8 @@ def run(payload: FitPayload, context: Context) -> FitResult:
             on_checkpoint=context.checkpoint,
             on_progress=on_progress,
             checkpoint_every_s=settings.checkpoint_s,
-            least_radiance=least_radiance,
+            is_negligible=negligible,
+            is_start=is_light_field and settings.solver is Solver.COHERENT,
         )
     context.log(f"{payload.function.value}: log_mse_rel {outcome.metrics.log_mse_rel:.4f}")
     return FitResult(
@@ -65,9 +59,3 @@ def run(payload: FitPayload, context: Context) -> FitResult:
         steps=outcome.steps,
         seconds=outcome.seconds,
     )
-
-
-def _mean_radiance(store: LightFieldStore, tiles: Sequence[Tile], texel_map: TexelMap) -> float:
-    """Mean luminance of irradiance / pi over the valid texels, in W/(m^2 sr)."""
-    irradiance = store.read_irradiance(tiles)[texel_map.state == TexelState.VALID].astype(np.float64)
-    return float((irradiance @ np.array(LUMINANCE)).mean() / np.pi) if len(irradiance) else 0.0

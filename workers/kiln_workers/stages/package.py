@@ -13,11 +13,12 @@ import numpy.typing as npt
 from kiln_schemas import __version__
 from kiln_schemas.errors import InternalError
 from kiln_schemas.job import check_bundle
-from kiln_schemas.settings import Function, PackagedScene, PackageSettings
+from kiln_schemas.settings import FitSettings, Function, PackagedScene, PackageSettings
 from kiln_schemas.tasks import FitMetrics, FitResult, PackagePayload, PackageResult, RefineResult, Tile
 from kiln_workers.fit.metrics import TexelErrors, texel_errors
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.source import valid_texels
+from kiln_workers.fit.verdict import failure, has_failed, is_negligible
 from kiln_workers.package.build import EnvironmentTextures, LobeMap, PackageInput, build_package
 from kiln_workers.package.half import as_stored
 from kiln_workers.package.original import encode_original
@@ -27,7 +28,7 @@ from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import unpack_scene
 from kiln_workers.scene.model import Environment, Scene
 from kiln_workers.scene.picture import texel_map_picture
-from kiln_workers.scene.texel_map import TexelMap, unpack_texel_map
+from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
 from kiln_workers.sphere.gaussian import evaluate
 from kiln_workers.sphere.octahedral import pixel_directions
 from kiln_workers.stages.bundle import lay_out
@@ -71,7 +72,7 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
         texels = _Texels(store, texel_map, tiles, fit.function)
         refines = payload.refines if fit.function is Function.LIGHT_FIELD else ()
         with store.all_lost([fit.function.value], covered):
-            judged = _judge(fit, refines, texels, context)
+            judged = _judge(fit, refines, texels, payload.settings.fit, context)
         lobes[fit.function], metrics[fit.function], previews[fit.function] = judged
 
     context.progress(steps - 2, steps, "steps", "convolving the environment")
@@ -156,11 +157,12 @@ class _Texels:
 
 
 def _judge(
-    fit: FitResult, refines: Sequence[RefineResult], texels: _Texels, context: Context
+    fit: FitResult, refines: Sequence[RefineResult], texels: _Texels, settings: FitSettings, context: Context
 ) -> tuple[LobeMap, FitMetrics, FunctionPreview]:
     """Lobes of every valid texel as the texture will hold them, their errors, and the texels to show.
 
-    The lobes are those of the refined blocks, or the network's output where there are none.
+    The lobes are those of the refined blocks, or the network's output, which the fit has judged, where there are none.
+    Refined lobes that have failed are left out where the light field is too weak to be seen, else FitFailed.
     """
     weights = Weights.from_bytes(context.blob(fit.weights))
     shape = texels.map.state.shape
@@ -168,21 +170,31 @@ def _judge(
     mask = np.zeros(shape, bool)
     per_texel = np.full(shape, np.nan, np.float32)
     refined = _refined(refines, lobes, context) if refines else None
-    parts = []
-    for place, images, normals in texels.batches():
-        found = predict(weights, images, normals, threads=context.threads) if refined is None else refined[place]
-        stored = as_stored(found)
-        errors = texel_errors(stored, images, normals, weights.exposure)
-        lobes[place], mask[place] = stored, True
-        per_texel[place] = errors.error / errors.weight
-        parts.append(errors)
-    total = TexelErrors.join(parts)
+
+    def measured() -> TexelErrors:
+        parts = []
+        for place, images, normals in texels.batches():
+            found = predict(weights, images, normals, threads=context.threads) if refined is None else refined[place]
+            stored = as_stored(found)
+            errors = texel_errors(stored, images, normals, weights.exposure)
+            lobes[place], mask[place] = stored, True
+            per_texel[place] = errors.error / errors.weight
+            parts.append(errors)
+        return TexelErrors.join(parts)
+
+    total, signal = measured(), fit.metrics.signal
+    if refined is not None and signal and has_failed(total):
+        irradiance = texels.store.read_irradiance(texels.tiles)[texels.map.state == TexelState.VALID]
+        if not is_negligible(weights.exposure, irradiance):
+            raise failure(total, fit.function, "refine_steps", settings.refine_steps, settings.lobes)
+        refined[..., 4:] = 0.0
+        total, signal = measured(), False
     metrics = FitMetrics(
         log_mse=total.log_mse,
         log_mse_zero=total.log_mse_zero,
         log_mse_rel=total.log_mse_rel,
         texels=len(total.error),
-        signal=fit.metrics.signal,
+        signal=signal,
     )
     best, median, worst = (_preview(texels, lobes, per_texel, at) for at in choose_texels(per_texel))
     return LobeMap(lobes, mask), metrics, FunctionPreview(best, median, worst, per_texel)

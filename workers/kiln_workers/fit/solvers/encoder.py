@@ -25,10 +25,11 @@ def cnn(
     function: Function = Function.LIGHT_FIELD,
     seed: int = 0,
     start: Weights | None = None,
+    is_start: bool = False,
 ) -> Solution:
     """Trained on the field alone, for `settings.steps`, from `start` or from random weights.
 
-    FitFailed where it does not clearly beat P = 0.
+    FitFailed where it does not clearly beat P = 0, unless a descent starts from it (`is_start`).
     """
     watch = Stopwatch(on_epoch)
     threads = torch.get_num_threads()
@@ -39,7 +40,15 @@ def cnn(
         watch.tell(epoch, lambda: _represent(field, weights, threads))
 
     outcome = train(
-        source, asked, function, seed, threads=threads, exposure=field.exposure, on_epoch=listen, start=start
+        source,
+        asked,
+        function,
+        seed,
+        threads=threads,
+        exposure=field.exposure,
+        on_epoch=listen,
+        start=start,
+        is_start=is_start,
     )
     solved = _represent(field, Weights.from_bytes(outcome.weights), threads)
     return Solution(solved, -(-outcome.steps * asked.batch // len(field)), watch.seconds)

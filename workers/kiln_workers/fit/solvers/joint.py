@@ -84,7 +84,7 @@ def coherent(
 ) -> Solution:
     """The network after `settings.start_steps`, then `refine_steps` of the descent; epochs and seconds of both."""
     start_settings = settings.model_copy(update={"steps": settings.start_steps})
-    trained = cnn(field, lobes, on_epoch, settings=start_settings, seed=seed)
+    trained = cnn(field, lobes, on_epoch, settings=start_settings, seed=seed, is_start=True)
     watch = Stopwatch(on_epoch)
     normals = torch.from_numpy(field.normals)
 
