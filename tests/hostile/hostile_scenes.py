@@ -745,9 +745,77 @@ def _xmls() -> Iterator[Bad]:
     yield raw("nothing in it", "no faces", b"<scene/>", "scene.xml")
 
 
+# Collada
+
+SHEET: Final = """<geometry id="g"><mesh><source id="p"><float_array id="a">0 0 0 1 0 0 0 1 0</float_array>
+  <technique_common><accessor source="#a" count="3" stride="3"/></technique_common></source>
+  <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+  <triangles material="m" count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles>
+  </mesh></geometry>"""
+USED: Final = '<instance_geometry url="#g"/>'
+
+
+def dae(name: str, word: str, nodes: str = USED, shape: str = SHEET, head: str = "", image: str = "") -> Bad:
+    """A lit sheet of Collada, or what is left of it; `image` is the path of its light's texture."""
+    picture = f'<library_images><image id="i"><init_from>{image}</init_from></image></library_images>' if image else ""
+    glow = '<texture texture="i"/>' if image else "<color>1 1 1 1</color>"
+
+    def build(_: Path) -> Files:
+        text = f"""{head}<COLLADA>{picture}<library_materials><material id="m"><instance_effect url="#e"/></material>
+          </library_materials><library_effects><effect id="e"><profile_COMMON><technique><lambert><emission>{glow}
+          </emission></lambert></technique></profile_COMMON></effect></library_effects>
+          <library_geometries>{shape}</library_geometries><library_visual_scenes><visual_scene>
+          <node id="n">{nodes}</node></visual_scene></library_visual_scenes></COLLADA>"""
+        return {"scene.dae": text.encode()}
+
+    return Bad(f"Collada: {name}", word, build)
+
+
+def _daes() -> Iterator[Bad]:
+    yield dae("billion laughs", "document type", "&l9;", head=f'<!DOCTYPE COLLADA [<!ENTITY l0 "lol">{LAUGHS}]>')
+    outside = '<!DOCTYPE COLLADA [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
+    yield dae("an external entity", "document type", "&x;", head=outside)
+    twice = "".join(f'<node id="k{i}">{f"""<instance_node url="#k{i + 1}"/>""" * 2}</node>' for i in range(50))
+    yield dae("copies of copies, 50 times", "nodes with all its instances", f'{twice}<node id="k50">{USED}</node>')
+    yield dae("a node that holds itself", "hold themselves", '<instance_node url="#n"/>')
+    yield dae("300 nodes deep", "nests too deeply", "<node>" * 300 + "</node>" * 300)
+    yield dae("100001 instances", "at most 100000", USED * 100_001)
+    yield dae("a geometry in another file", "names no", '<instance_geometry url="file:///etc/passwd#g"/>')
+    yield dae("a geometry that is a node", "names no", '<instance_geometry url="#n"/>')
+    yield dae("moved by NaN", "not finite", "<translate>nan 0 0</translate>" + USED)
+    yield dae("moved by 1e300", "beyond", "<translate>1e300 0 0</translate>" + USED)
+    yield dae("scaled by 1e300 twice", "not finite", "<scale>1e300 1 1</scale>" * 2 + USED)
+    for what, old, new, word in (
+        ("10^11 rows", 'count="3" stride', 'count="99999999999" stride', "rows of data"),
+        ("rows of 10^11", 'stride="3"', 'stride="99999999999"', "numbers"),
+        ("a negative count", 'count="3" stride', 'count="-3" stride', "no count"),
+        ("10^11 numbers a corner", 'offset="0"', 'offset="99999999999"', "to a corner"),
+        ("a corner of 10^30", "0 1 2<", f"0 1 {10**30}<", "of 3"),
+        ("corners of letters", "0 1 2<", "a b c<", "no number"),
+        ("points of letters", "0 0 0 1", "x y z w", "no number"),
+        ("points of NaN", "0 0 0 1", "nan 0 0 1", "vertex 0"),
+        ("a source of itself", 'source="#p"', 'source="#v"', "names no"),
+        ("polygons of 10^18 corners", "<p>", f"<vcount>{10**18}</vcount><p>", "vcount"),
+        ("polygons of -1 corners", "<p>", "<vcount>-1 4</vcount><p>", "vcount"),
+    ):
+        shape = SHEET.replace(old, new)
+        yield dae(what, word, shape=shape.replace("triangles", "polylist") if "polygons" in what else shape)
+    for path in ("/etc/passwd", "../secret.png", "file:///etc/passwd", "http://127.0.0.1:9/secret.png", "gone.png"):
+        # What leads out of the bundle is no texture; this one is the only light.
+        yield (
+            dae(f"the light of {path}", "neither PNG", image="scene.dae")
+            if path == "gone.png"
+            else dae(f"light of {path}", "nothing in the scene emits", image=path)
+        )
+    yield raw("nothing", "not well-formed", b"", "scene.dae")
+    yield raw("another root", "not with <COLLADA>", b"<svg/>", "scene.dae")
+    yield raw("1000001 elements", "too many elements", b"<COLLADA>" + b"<p/>" * 1_000_001 + b"</COLLADA>", "scene.dae")
+    yield raw("nothing in it", "no faces", b"<COLLADA/>", "scene.dae")
+
+
 SCENES: Final = [
     *(*_uris(), *_documents(), *_ranges(), *_geometry(), *_binaries(), *_images()),
-    *(*_objs(), *_plys(), *_xmls()),
+    *(*_objs(), *_plys(), *_xmls(), *_daes()),
 ]
 GOOD: Final = Bad("a lit triangle", "", lambda _: {"scene.gltf": json.dumps(triangle().document()).encode()})
 """What all these would be if they were not spoilt."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kiln_schemas.camera import Camera
+from kiln_workers.scene.file_camera import file_camera
 from kiln_workers.scene.gltf_camera import gltf_camera
 from kiln_workers.shade.camera import camera_frame
 
@@ -56,4 +57,4 @@ def test_what_is_no_usable_camera_is_passed_over(cameras: list[object], node: di
 
 
 def test_other_formats_have_none() -> None:
-    assert gltf_camera(b"v 0 0 0", "scene.obj") is None
+    assert file_camera(b"v 0 0 0", "scene.obj") is None

@@ -27,7 +27,7 @@ from pydantic import ValidationError
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.files import LeavesFolder, NotRegular, is_inside, open_inside
-from kiln_schemas.formats import CONVERTERS, MITSUBA_INCLUDES, MITSUBA_UNUSED
+from kiln_schemas.formats import CONVERTERS, MITSUBA_INCLUDES, MITSUBA_UNUSED, ends_of_path
 from kiln_schemas.job import check_bundle, check_bundle_path
 from kiln_schemas.tasks import PATH_LENGTH, Bundle, EnvironmentRef
 from kiln_schemas.text import told
@@ -258,6 +258,32 @@ class _Elements(ElementTree.TreeBuilder):
         )
 
 
+def _collada(folder: Path, name: str) -> References:
+    """Textures that are in the folder; the reader leaves the others out, with a note."""
+    for node in _parsed(folder, name).iter():
+        if node.tag.rpartition("}")[2] in ("init_from", "ref") and node.text:
+            yield from _texture(folder, name, node.text)
+
+
+def _texture(folder: Path, name: str, reference: str) -> References:
+    """The file that `scene.texture_files` finds for the path of a texture."""
+    for end in ends_of_path(reference):
+        with contextlib.suppress(InputError):  # no name of a bundle
+            path = _joined(name, end)
+            if is_inside(folder, path):
+                yield path, name
+                return
+
+
+def _parsed(folder: Path, name: str) -> ElementTree.Element:
+    """The tree of an XML file."""
+    try:
+        return ElementTree.fromstring(_read(folder, name), ElementTree.XMLParser(target=_Elements(name)))
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two of encodings
+        detail = f"is not XML: {told(str(error), 80)}"
+        raise InputError(detail, where=name, remedy="Export the scene again.") from None
+
+
 def _mitsuba_xml(folder: Path, name: str) -> References:
     yield from _MitsubaFiles(folder, name).references(name)
 
@@ -274,13 +300,7 @@ class _MitsubaFiles:
 
     def references(self, name: str) -> References:
         """The files that an XML file names, and those of the files that it includes."""
-        text = _read(self.folder, name)
-        try:
-            root = ElementTree.fromstring(text, ElementTree.XMLParser(target=_Elements(name)))
-        except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two of encodings
-            detail = f"is not XML: {told(str(error), 80)}"
-            raise InputError(detail, where=name, remedy="Export the scene again.") from None
-        waiting = [(root, True)]
+        waiting = [(_parsed(self.folder, name), True)]
         while waiting:
             node, used = waiting.pop()
             yield from self._element(node, name, used)
@@ -349,4 +369,5 @@ READERS: Final[Mapping[str, Callable[[Path, str], References]]] = {
     ".xml": _mitsuba_xml,
     ".stl": _nothing,
     ".off": _nothing,
+    ".dae": _collada,
 }

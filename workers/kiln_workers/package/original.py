@@ -22,11 +22,12 @@ from kiln_schemas.errors import InputError
 from kiln_schemas.text import told
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.geometry import Floats, Ints, sound_faces
-from kiln_workers.scene.gltf import FAN, STRIP, TRIANGLES, _local_matrix, _triangulated
+from kiln_workers.scene.gltf import _local_matrix
 from kiln_workers.scene.gltf_buffers import CHUNK_BIN, CHUNK_JSON, COMPONENTS, GltfBuffers, split_glb
 from kiln_workers.scene.gltf_document import Document, Primitive, parse_document
 from kiln_workers.scene.limits import NAME_LENGTH
 from kiln_workers.scene.model import Mesh
+from kiln_workers.scene.polygons import FAN, STRIP, TRIANGLES, listed_faces
 
 SUFFIXES: Final = (".glb", ".gltf")
 SET: Final = "TEXCOORD_1"
@@ -131,7 +132,7 @@ class _Writer:
         order = np.arange(len(positions), dtype=np.int64)
         if primitive.indices is not None:
             order = self.buffers.indices(primitive.indices)
-        return positions, _triangulated(order, primitive.mode)
+        return positions, listed_faces(order, primitive.mode)
 
     def _write(self, tree: dict[str, Any], primitive: Primitive, count: int, faces: Ints, uv: Floats) -> None:
         """Give a primitive the UVs [F, 3, 2]; vertices that have several are duplicated."""

@@ -43,8 +43,7 @@ from kiln_workers.scene.gltf_document import (
 from kiln_workers.scene.gltf_extensions import check_extensions
 from kiln_workers.scene.gltf_materials import MaterialTable
 from kiln_workers.scene.model import LightKind, Mesh, PunctualLight, Scene
-
-TRIANGLES, STRIP, FAN = 4, 5, 6
+from kiln_workers.scene.polygons import FAN, STRIP, TRIANGLES, listed_faces
 
 
 def read_gltf(folder: Path, entry: str) -> Scene:
@@ -254,7 +253,7 @@ class _Reader:
         raw = RawMesh(
             name=name,
             positions=moved,
-            faces=order.reshape(-1, 3) if packed is not None else _triangulated(order, primitive.mode),
+            faces=order.reshape(-1, 3) if packed is not None else listed_faces(order, primitive.mode),
             material=material,
             normals=attribute("NORMAL", 3),
             uv=uv[0],
@@ -366,18 +365,6 @@ def _trs(translation: Floats, rotation: Floats, scale: Floats) -> Floats:
     matrix[:3, :3] = turn * scale[None, :]
     matrix[:3, 3] = translation
     return matrix
-
-
-def _triangulated(order: Ints, mode: int) -> Ints:
-    """Faces [F, 3] of a list, strip or fan of vertices (glTF 2.0, 3.7.2.1)."""
-    if mode == TRIANGLES:
-        return order[: len(order) // 3 * 3].reshape(-1, 3)
-    count = max(len(order) - 2, 0)
-    i = np.arange(count)
-    if mode == FAN:
-        return np.stack([order[i + 1], order[i + 2], np.broadcast_to(order[:1], count)], axis=1).reshape(-1, 3)
-    odd = i % 2
-    return np.stack([order[i], order[i + 1 + odd], order[i + 2 - odd]], axis=1).reshape(-1, 3)
 
 
 def _triple(vector: Floats) -> tuple[float, float, float]:

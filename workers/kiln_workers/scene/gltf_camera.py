@@ -6,23 +6,20 @@ without one.
 """
 
 import math
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
 from kiln_schemas.camera import Camera
+from kiln_workers.scene.geometry import Floats
 from kiln_workers.scene.gltf import placed_nodes
 from kiln_workers.scene.gltf_buffers import split_glb
 from kiln_workers.scene.gltf_document import parse_document
 
-SUFFIXES: Final = (".glb", ".gltf")
-
 
 def gltf_camera(data: bytes, entry: str) -> Camera | None:
-    """The camera of a scene file, its target 1 m before it; None where it has none, or is no glTF file."""
-    if not entry.lower().endswith(SUFFIXES):
-        return None
+    """The camera of a glTF file, its target 1 m before it; None where it has none."""
     text, _ = split_glb(data, entry)
     document = parse_document(text, entry)
     for placed in placed_nodes(document, entry):
@@ -34,7 +31,15 @@ def gltf_camera(data: bytes, entry: str) -> Camera | None:
     return None
 
 
-def _camera(part: Any, matrix: np.ndarray[Any, np.dtype[np.float64]]) -> Camera | None:
+def _camera(part: Any, matrix: Floats) -> Camera | None:
+    try:
+        return camera_at(matrix, float(part["perspective"]["yfov"]))
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def camera_at(matrix: Floats, vertical: float) -> Camera | None:
+    """The camera of a node, `vertical` radians of view high; None where that is no usable camera."""
     position, forward, up = matrix[:3, 3], -matrix[:3, 2], matrix[:3, 1]
     lengths = np.linalg.norm(forward), np.linalg.norm(up)
     if min(lengths) == 0.0:
@@ -46,8 +51,8 @@ def _camera(part: Any, matrix: np.ndarray[Any, np.dtype[np.float64]]) -> Camera 
                 "position": position.tolist(),
                 "target": (position + forward).tolist(),
                 "up": up.tolist(),
-                "fov_deg": math.degrees(part["perspective"]["yfov"]),
+                "fov_deg": math.degrees(vertical),
             }
         )
-    except (KeyError, TypeError, ValidationError):
+    except ValidationError:
         return None

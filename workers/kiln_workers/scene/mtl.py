@@ -18,9 +18,10 @@ from kiln_schemas.text import told
 from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.gltf_materials import make_image
 from kiln_workers.scene.images import linear_pixels
-from kiln_workers.scene.limits import MAX_ENTRIES, MAX_IMAGE_BYTES, MAX_TEXT_BYTES, NAME_LENGTH, check_count
+from kiln_workers.scene.limits import MAX_ENTRIES, MAX_TEXT_BYTES, NAME_LENGTH, check_count
 from kiln_workers.scene.model import Image, Material, TextureRef
 from kiln_workers.scene.text_lines import statements
+from kiln_workers.scene.texture_files import with_alpha
 
 MAP_LENGTH: Final = 2 * PATH_LENGTH
 NUMBER_KEYS: Final = {"kd", "ke", "ks", "ns", "pm", "pr", "d", "tr", "ni"}
@@ -99,10 +100,8 @@ class MaterialLibrary:
         # An image with alpha is opacity by that, any other by its value.
         value = pixels[..., 3] if image.pixels.shape[2] in (2, 4) else pixels[..., :3].mean(axis=2)
         colour = np.ones((1, 1, 4), np.float32) if base is None else linear_pixels(self.images[base.image])
-        height, width = np.maximum(value.shape, colour.shape[:2])
-        check_count(int(height * width * 16), MAX_IMAGE_BYTES, "bytes in its textures", f"material '{title}'")
-        merged = np.concatenate([_scaled(colour[..., :3], height, width), _scaled(value[..., None], height, width)], 2)
-        self.images.append(Image(f"{title} with map_d", merged.astype(np.float32), False))
+        merged = with_alpha(colour, value, f"material '{title}'")
+        self.images.append(Image(f"{title} with map_d", merged, False))
         return replace(material, base_color_texture=replace(base or cover, image=len(self.images) - 1))
 
     def _opaque(self, material: Material, base: TextureRef) -> Material:
@@ -205,15 +204,6 @@ def _is_number(words: list[str]) -> bool:
         return bool(words) and float(words[0]) is not None
     except ValueError:
         return False
-
-
-def _scaled(
-    pixels: np.ndarray[tuple[int, ...], np.dtype[np.float32]], height: int, width: int
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    """[height, width, C] of an image, each pixel repeated or the nearest taken."""
-    rows = np.arange(height) * pixels.shape[0] // height
-    columns = np.arange(width) * pixels.shape[1] // width
-    return np.asarray(pixels[rows[:, None], columns])
 
 
 def _library_names(line: str, bundle: BundleFolder) -> list[str]:

@@ -12,6 +12,8 @@ import numpy as np
 
 from kiln_workers.scene.geometry import Floats, Ints
 
+TRIANGLES, STRIP, FAN = 4, 5, 6
+"""How a list of vertices makes faces, as glTF numbers it."""
 CONCAVE: Final = -1e-9
 """A corner turns back if its turn is below this part of the polygon's own size squared."""
 
@@ -29,13 +31,25 @@ def triangulated(positions: Floats, sizes: Ints) -> Ints:
         parts.append(fan[~concave].reshape(-1, 3))
         owners.append(np.repeat(which[~concave], size - 2))
         for polygon in np.flatnonzero(concave):
-            cut = _cut(positions[corners[polygon]])
-            parts.append(corners[polygon][cut] if len(cut) else fan[polygon])
+            inner = cut(positions[corners[polygon]])
+            parts.append(corners[polygon][inner] if len(inner) else fan[polygon])
             owners.append(np.full(len(parts[-1]), which[polygon]))
     if not parts:
         return np.zeros((0, 3), np.int64)
     # Faces come in the order of their polygons.
     return np.concatenate(parts)[np.argsort(np.concatenate(owners), kind="stable")]
+
+
+def listed_faces(order: Ints, mode: int) -> Ints:
+    """Faces [F, 3] of a list, strip or fan of vertices (glTF 2.0, 3.7.2.1)."""
+    if mode == TRIANGLES:
+        return order[: len(order) // 3 * 3].reshape(-1, 3)
+    count = max(len(order) - 2, 0)
+    i = np.arange(count)
+    if mode == FAN:
+        return np.stack([order[i + 1], order[i + 2], np.broadcast_to(order[:1], count)], axis=1).reshape(-1, 3)
+    odd = i % 2
+    return np.stack([order[i], order[i + 1 + odd], order[i + 2 - odd]], axis=1).reshape(-1, 3)
 
 
 def _normals(points: Floats) -> Floats:
@@ -52,9 +66,13 @@ def _concave(points: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     return np.asarray(turn.min(axis=1) < CONCAVE * np.einsum("kd,kd->k", normal, normal))
 
 
-def _cut(points: Floats) -> Ints:
-    """Triangles [T, 3] of one polygon [N, 3]; none if it has no area."""
-    normal = _normals(points[None])[0]
+def cut(points: Floats, ends: Ints | None = None) -> Ints:
+    """Triangles [T, 3] of one polygon [N, 3]; none if it has no area.
+
+    Where it has holes, its outline and then each hole end before the corners `ends` [R].
+    """
+    outline = len(points) if ends is None else int(ends[0])
+    normal = _normals(points[None, :outline])[0]
     length = float(np.linalg.norm(normal))
     if length == 0.0 or not np.isfinite(length):
         return np.zeros((0, 3), np.int64)
@@ -62,8 +80,8 @@ def _cut(points: Floats) -> Ints:
     across = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
     across /= np.linalg.norm(across)
     flat = (points - points[0]) @ np.stack([across, np.cross(normal, across)], axis=1)
-    ends = np.array([len(points)], np.uint32)
-    cut = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends).reshape(-1, 3).astype(np.int64)
-    a, b, c = (flat[cut[:, corner]] for corner in range(3))
+    rings = np.array([len(points)] if ends is None else ends, np.uint32)
+    found = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), rings).reshape(-1, 3).astype(np.int64)
+    a, b, c = (flat[found[:, corner]] for corner in range(3))
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-    return np.asarray(np.where((area < 0.0)[:, None], cut[:, ::-1], cut))
+    return np.asarray(np.where((area < 0.0)[:, None], found[:, ::-1], found))

@@ -29,7 +29,7 @@ from kiln_schemas.tasks import FitMetrics, PackagePayload
 from kiln_workers.package import colour
 from kiln_workers.package.gates import Judgement, View
 from kiln_workers.render.backend import select_variant
-from kiln_workers.scene.gltf_camera import gltf_camera
+from kiln_workers.scene.file_camera import file_camera
 from kiln_workers.scene.model import Float32, Scene
 from kiln_workers.shade.first_camera import first_camera
 from kiln_workers.shade.gbuffer import render_gbuffer
@@ -117,7 +117,7 @@ class GateJudge:
         if self.payload.cameras:
             return next(iter(self.payload.cameras.items()))
         bundle = self.payload.bundle
-        stated = gltf_camera(self.read_blob(bundle.files[bundle.entry]), bundle.entry)
+        stated = file_camera(self.read_blob(bundle.files[bundle.entry]), bundle.entry)
         return FIRST_CAMERA, first_camera(self.scene, PICTURE[0] / PICTURE[1], stated)
 
     def _depth(self) -> int:
