@@ -17,7 +17,6 @@ MOST_FOLDERS: Final = 32
 """Folders of it."""
 
 CONVERTERS: Final[Mapping[str, str]] = {
-    ".fbx": "Convert it with FBX2glTF, or open it in Blender and export glTF.",
     ".zae": "Unpack it, as a ZIP archive, and give the .dae file in it.",
     ".blend": "Open it in Blender and export glTF.",
     **dict.fromkeys(

@@ -152,9 +152,9 @@ def test_odd_gltf_is_left_to_the_worker(tmp_path: Path, document: str) -> None:
 
 
 def test_other_formats_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.fbx").write_bytes(b"")
-    with pytest.raises(InputError, match=r"'\.fbx' is not a scene format.*FBX2glTF"):
-        collect(tmp_path / "a.fbx")
+    (tmp_path / "a.max").write_bytes(b"")
+    with pytest.raises(InputError, match=r"'\.max' is not a scene format.*glTF"):
+        collect(tmp_path / "a.max")
     (tmp_path / "a.odd").write_bytes(b"")
     with pytest.raises(InputError, match=r"'\.odd' is not a scene format.*\.glb"):
         collect(tmp_path / "a.odd")

@@ -1,6 +1,7 @@
 """A whole bake in one process, by the real stages, without a coordinator."""
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -107,14 +108,27 @@ class Baked:
 
 def bake(folder: Path, scene: Scene, settings: BakeSettings, **asked: Any) -> Baked:
     """Bake a scene, the store being `folder / "store.zarr"`; `asked` are gates and cameras of the job."""
+    files, environment = {"room.glb": encode_glb(scene)}, None
+    if scene.environment is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_exr(folder / "sky.exr", scene.environment.pixels)
+        files["sky.exr"] = (folder / "sky.exr").read_bytes()
+        environment = EnvironmentRef(file="sky.exr")
+    return bake_files(folder, files, settings, environment, **asked)
+
+
+def bake_files(
+    folder: Path,
+    files: Mapping[str, bytes],
+    settings: BakeSettings,
+    environment: EnvironmentRef | None = None,
+    **asked: Any,
+) -> Baked:
+    """The same of a scene's files, by their names; the first is the scene."""
     context = MemoryContext(scratch=folder / "scratch")
     context.scratch.mkdir(parents=True)
-    files, environment = {"room.glb": context.put_blob(encode_glb(scene))}, None
-    if scene.environment is not None:
-        write_exr(folder / "sky.exr", scene.environment.pixels)
-        files["sky.exr"] = context.put_blob(folder / "sky.exr")
-        environment = EnvironmentRef(file="sky.exr")
-    bundle = Bundle(entry="room.glb", files=files, environment=environment)
+    hashes = {name: context.put_blob(data) for name, data in files.items()}
+    bundle = Bundle(entry=next(iter(files)), files=hashes, environment=environment)
     common: dict[str, Any] = {"settings": settings, "store_url": (folder / "store.zarr").absolute().as_uri()}
     payload = PreparePayload(bundle=bundle, **common)
     prepared = prepare.run(payload, context)
@@ -124,7 +138,7 @@ def bake(folder: Path, scene: Scene, settings: BakeSettings, **asked: Any) -> Ba
         render.run(RenderPayload(scene=prepared.scene, fine=prepared.fine, tile=tile, **placed), context)
         for tile in prepared.tiles
     )
-    functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if environment else [])
+    functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if prepared.has_environment else [])
     fits = tuple(fit.run(FitPayload(function=f, renders=renders, **maps), context) for f in functions)
     refine_payloads = tuple(
         RefinePayload(block=block, renders=renders, fit=fits[0], **placed) for block in plan_blocks(prepared, settings)

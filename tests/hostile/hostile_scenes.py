@@ -813,9 +813,50 @@ def _daes() -> Iterator[Bad]:
     yield raw("nothing in it", "no faces", b"<COLLADA/>", "scene.dae")
 
 
+# FBX
+
+
+def fbx_record(name: bytes, properties: Sequence[bytes] = (), inner: bytes = b"", at: int = 0) -> bytes:
+    """A binary record that begins at `at`; `inner` are the records in it."""
+    packed = b"".join(properties)
+    inner = inner + bytes(13) if inner else b""
+    end = at + 13 + len(name) + len(packed) + len(inner)
+    return struct.pack("<IIIB", end, len(properties), len(packed), len(name)) + name + packed + inner
+
+
+def fbx_file(records: Callable[[int], bytes]) -> bytes:
+    head = b"Kaydara FBX Binary  \0\x1a\0" + struct.pack("<I", 7400)
+    return head + records(len(head)) + bytes(13)
+
+
+def _fbxs() -> Iterator[Bad]:
+    def array(kind: bytes, length: int, stored: bytes) -> bytes:
+        return kind + struct.pack("<III", length, 1, len(stored)) + stored
+
+    zeros = array(b"d", 8 << 20, zlib.compress(bytes(64 << 20), 9))
+    bomb = fbx_file(lambda at: fbx_record(b"Objects", [zeros, zeros], at=at))
+    for name, word, data in (
+        ("nothing", "cannot be read as FBX", b""),
+        ("text", "cannot be read as FBX", b"hello"),
+        ("an OBJ file", "cannot be read as FBX", FACE.encode()),
+        ("a header alone", "fbx", fbx_file(lambda _: b"")),
+        ("noise behind a header", "cannot be read as FBX", fbx_file(lambda _: bytes(range(1, 256)) * 9)),
+        ("a record that ends before it begins", "fbx", fbx_file(lambda _: struct.pack("<IIIB", 5, 1, 9, 3) + b"abc")),
+        ("arrays that inflate 1000 times", "when they are inflated", bomb),
+        (
+            "an array of 2^32-1 numbers",
+            "when they are inflated",
+            fbx_file(lambda at: fbx_record(b"V", [array(b"d", 2**32 - 1, zlib.compress(b"1"))], at=at)),
+        ),
+        ("300 records deep", "cannot be read as FBX", b"; FBX 7.4.0 project file\nO: " + b"{ O: " * 300),
+        ("a list of 10^12 numbers", "fbx", b"; FBX 7.4.0 project file\nV: *1000000000000 { a: 1 }"),
+    ):
+        yield raw(name, word, data, "scene.fbx")
+
+
 SCENES: Final = [
     *(*_uris(), *_documents(), *_ranges(), *_geometry(), *_binaries(), *_images()),
-    *(*_objs(), *_plys(), *_xmls(), *_daes()),
+    *(*_objs(), *_plys(), *_xmls(), *_daes(), *_fbxs()),
 ]
 GOOD: Final = Bad("a lit triangle", "", lambda _: {"scene.gltf": json.dumps(triangle().document()).encode()})
 """What all these would be if they were not spoilt."""

@@ -66,7 +66,7 @@ def test_broken_off_is_refused(tmp_path, text, says):
 
 @pytest.mark.parametrize(
     ("suffix", "names"),
-    [(".fbx", "FBX2glTF"), (".zae", "ZIP"), (".3ds", "Blender"), (".blend", "Blender"), (".usdz", "glTF")],
+    [(".zae", "ZIP"), (".3ds", "Blender"), (".blend", "Blender"), (".usdz", "glTF")],
 )
 def test_what_is_not_read_names_a_converter(tmp_path, suffix, names):
     (tmp_path / f"a{suffix}").write_bytes(b"x")

@@ -265,6 +265,16 @@ def _collada(folder: Path, name: str) -> References:
             yield from _texture(folder, name, node.text)
 
 
+def _fbx(folder: Path, name: str) -> References:
+    """Textures that are in the folder. FBX compresses arrays alone, so names stand in binary files as they are."""
+    data = _read(folder, name)
+    binary = re.finditer(rb"(?:Relative)?File[nN]ameS(.{4})", data, re.DOTALL)
+    found = [data[match.end() : match.end() + min(struct.unpack("<I", match[1])[0], PATH_LENGTH)] for match in binary]
+    found += re.findall(rb'(?:Relative)?File[nN]ame: *"([^"\r\n]{1,512})"', data)
+    for reference in dict.fromkeys(found):
+        yield from _texture(folder, name, reference.decode(errors="replace"))
+
+
 def _texture(folder: Path, name: str, reference: str) -> References:
     """The file that `scene.texture_files` finds for the path of a texture."""
     for end in ends_of_path(reference):
@@ -370,4 +380,5 @@ READERS: Final[Mapping[str, Callable[[Path, str], References]]] = {
     ".stl": _nothing,
     ".off": _nothing,
     ".dae": _collada,
+    ".fbx": _fbx,
 }

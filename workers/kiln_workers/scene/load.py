@@ -1,6 +1,6 @@
 """One door for scenes: the reader is chosen by the entry's suffix, the environment is added, and the whole is checked.
 
-glTF and GLB are the main format; OBJ, PLY, STL, OFF, Collada and Mitsuba XML become the same model.
+glTF and GLB are the main format; OBJ, PLY, STL, OFF, Collada, FBX and Mitsuba XML become the same model.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,6 +13,7 @@ from kiln_schemas.formats import CONVERTERS
 from kiln_schemas.tasks import EnvironmentRef
 from kiln_workers.scene.collada import read_collada
 from kiln_workers.scene.environment import load_environment
+from kiln_workers.scene.fbx import read_fbx
 from kiln_workers.scene.gltf import read_gltf
 from kiln_workers.scene.limits import READING_S, deadline
 from kiln_workers.scene.mitsuba_xml import read_mitsuba_xml
@@ -32,6 +33,7 @@ READERS: Final[Mapping[str, Callable[[Path, str], Scene]]] = {
     ".stl": read_stl,
     ".off": read_off,
     ".dae": read_collada,
+    ".fbx": read_fbx,
 }
 
 

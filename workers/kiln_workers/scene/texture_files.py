@@ -3,6 +3,7 @@
 A texture that is not there is left out with a note: the paths in these files are those of another machine.
 """
 
+import hashlib
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -27,11 +28,11 @@ class TextureFiles:
     bundle: BundleFolder
     notes: list[str]
     images: list[Image] = field(default_factory=list)
-    _known: dict[tuple[str, bool], int | None] = field(default_factory=dict)
+    _known: dict[tuple[str, bool, bytes], int | None] = field(default_factory=dict)
 
     def image(self, reference: str, srgb: bool, where: str, content: bytes = b"") -> int | None:
         """Position in `images` of the texture that a file names, or has as `content`; None where it is not there."""
-        key = (reference, srgb)
+        key = (reference, srgb, hashlib.sha256(content).digest())
         if key not in self._known:
             check_count(len(self._known), MAX_ENTRIES, "textures", self.bundle.origin)
             name = None if content else self._found(reference)
@@ -59,6 +60,34 @@ class TextureFiles:
         merged = with_alpha(colour, 1.0 - value if invert else value, f"material '{material.name}'")
         self.images.append(Image(f"{material.name} with opacity", merged, False))
         return replace(material, base_color_texture=replace(base or cover, image=len(self.images) - 1))
+
+    def combined(
+        self, name: str, rough: TextureRef | None, metal: TextureRef | None, invert: bool
+    ) -> TextureRef | None:
+        """One texture of roughness (G, 1 less it where `invert` is set) and metallic (B) from one of each."""
+        reference = rough or metal
+        if reference is None:
+            return None
+        if rough is not None and metal is not None and replace(rough, image=0) != replace(metal, image=0):
+            self.notes.append(f"Material '{name}': its metallic texture is laid out as its roughness'.")
+        green, blue = (
+            np.ones((1, 1), np.float32) if part is None else luminance(linear_pixels(self.images[part.image]))
+            for part in (rough, metal)
+        )
+        green = 1.0 - green if invert and rough is not None else green
+        height, width = (int(size) for size in np.maximum(green.shape, blue.shape))
+        check_count(height * width * 12, MAX_IMAGE_BYTES, "bytes in its textures", f"material '{name}'")
+        parts = [_scaled(part[..., None], height, width) for part in (np.ones((1, 1), np.float32), green, blue)]
+        self.images.append(
+            Image(f"{name} roughness, metallic", np.concatenate(parts, axis=2).astype(np.float32), False)
+        )
+        return replace(reference, image=len(self.images) - 1)
+
+    def is_normal_map(self, reference: TextureRef) -> bool:
+        """Whether an image holds normals, which are of length 1 and look upwards, not heights."""
+        pixels = linear_pixels(self.images[reference.image])[..., :3] * 2.0 - 1.0
+        length = np.linalg.norm(pixels, axis=2)
+        return bool(np.median(np.abs(length - 1.0)) < 0.1 and np.median(pixels[..., 2]) > 0.5)
 
     def _found(self, reference: str) -> str | None:
         for name in ends_of_path(reference):
