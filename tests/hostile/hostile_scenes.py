@@ -429,6 +429,13 @@ def _images() -> Iterator[Bad]:
     yield textured("a zip", "neither PNG", zipped({"a.png": png(4, 4)}))
     yield textured("a gzip", "neither PNG", gzip.compress(png(4, 4)))
     yield textured("text", "neither PNG", b"hello")
+    for kind in (2, 10, 1, 9):
+        head = struct.pack("<BBBHHBHHHHBB", 0, kind % 8 == 1, kind, 0, 0, 24, 0, 0, 65535, 65535, 24, 0)
+        yield textured(f"TGA of kind {kind}, 65535 x 65535", "cannot be decoded", head + bytes(99))
+    yield textured("TGA cut off", "picture", struct.pack("<BBBHHBHHHHBB", 0, 0, 10, 0, 0, 0, 0, 0, 64, 64, 24, 0))
+    bmp = b"BM" + struct.pack("<IIIIiiHHIIiiII", 99, 0, 54, 40, 10**5, 10**5, 1, 24, 0, 0, 0, 0, 0, 0)
+    yield textured("BMP of 10^5 x 10^5", "cannot be decoded", bmp + bytes(99))
+    yield textured("BMP cut off", "picture", b"BM" + bytes(20))
     yield textured("nothing", "neither PNG", b"")
     yield textured(
         "what begins like HDR", "picture.png", b"#?" + b"\0\0\2" + b"\0" * 9 + struct.pack("<HHBB", 9, 9, 24, 0)

@@ -1,5 +1,7 @@
 """Colours of a texture are those that its file stores, whatever its alpha is (glTF 2.0, 3.9.2 and 3.9.4)."""
 
+import struct
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -50,3 +52,29 @@ def test_a_panel_glows_as_bright_whatever_the_alpha_of_its_texture(irradiance_in
 def test_a_floor_reflects_as_much_whatever_the_alpha_of_its_texture(irradiance_in, name):
     """On the ceiling 0.262, by plain Mitsuba with Lambert's floor; glTF's floor reflects less at grazing angles."""
     np.testing.assert_allclose(irradiance_in(name, [[1.2, 2.2, 0]], normal=(0, -1, 0)), 0.262, rtol=0.05)
+
+
+@pytest.mark.parametrize("alpha", [0, 128, 255])
+def test_tga_is_read_as_it_is_stored(alpha):
+    """Written by hand: 32 bits, blue first, the bottom row first."""
+    pixels = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
+    pixels[..., 3] = alpha
+    head = struct.pack("<BBBHHBHHHHBB", 0, 0, 2, 0, 0, 0, 0, 0, 3, 2, 32, 8)
+    found = decode_image(head + pixels[::-1, :, [2, 1, 0, 3]].tobytes(), "image")
+    assert found.format == "tga"
+    np.testing.assert_array_equal(found.pixels, pixels)
+
+
+def test_compressed_tga_and_bmp_are_read():
+    """A run of three pixels and two by themselves; 24 bits, rows of BMP padded to four bytes."""
+    colours = np.array([[[9, 8, 7], [9, 8, 7], [9, 8, 7]], [[1, 2, 3], [4, 5, 6], [9, 8, 7]]], np.uint8)
+    head = struct.pack("<BBBHHBHHHHBB", 0, 0, 10, 0, 0, 0, 0, 0, 3, 2, 24, 32)  # the top row first
+    packed = bytes([0x82, 7, 8, 9]) + bytes([0x02, 3, 2, 1, 6, 5, 4, 7, 8, 9])
+    np.testing.assert_array_equal(decode_image(head + packed, "image").pixels, colours)
+    rows = b"".join(row[:, ::-1].tobytes() + bytes(3) for row in colours[::-1])
+    bmp = (
+        b"BM" + struct.pack("<IIIIiiHHIIiiII", 54 + len(rows), 0, 54, 40, 3, 2, 1, 24, 0, len(rows), 0, 0, 0, 0) + rows
+    )
+    found = decode_image(bmp, "image")
+    assert found.format == "bmp"
+    np.testing.assert_array_equal(found.pixels, colours)

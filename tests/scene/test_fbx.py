@@ -391,6 +391,14 @@ def test_skins_of_fbx_are_where_their_joints_put_them(tmp_path):
     np.testing.assert_allclose(found, right, atol=1e-4)
 
 
+def test_uv_sets_without_names_are_kept_apart(tmp_path):
+    layers = layer("UV", "UV", UV, 0) + layer("UV", "UV", SECOND_UV, 1)
+    objects = [mesh(GEOMETRY, POINTS, [[0, 1, 2, 3]], layers), model(200, "quad")]
+    (quad,) = load(tmp_path, document(objects, [(200, 0), (GEOMETRY, 200)])).meshes
+    for found, right in ((quad.uv, UV), (quad.lightmap_uv, SECOND_UV)):
+        np.testing.assert_allclose(np.unique(found, axis=0), np.unique(right * [1, -1] + [0, 1], axis=0), atol=1e-6)
+
+
 def test_hidden_nodes_and_further_levels_of_detail_are_left_out(tmp_path):
     objects = [
         QUAD,

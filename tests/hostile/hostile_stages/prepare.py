@@ -29,6 +29,8 @@ LIBRARIES = (
 )
 COORDINATOR = ("'127.0.0.1'", "('127.0.0.1', ", "b'127.0.0.1'")
 """What it may connect to."""
+FBX = repr([sys.executable, "-m", "kiln_workers.scene.fbx_native"])
+"""What it may start."""
 
 _seen: list[str] | None = None
 
@@ -44,7 +46,8 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
             if isinstance(path, str | bytes | os.PathLike):
                 _seen.append(f"{event} {folder / os.fsdecode(path)}")
     else:
-        _seen.append(f"{event} {arguments[-1 if event == 'socket.connect' else 0]!r}")
+        which = {"socket.connect": -1, "subprocess.Popen": 1}.get(event, 0)
+        _seen.append(f"{event} {arguments[which]!r}")
 
 
 def _walked() -> Path:
@@ -70,7 +73,7 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         return prepare.run(payload, context)
     finally:
         seen, _seen = _seen, None
-        strays = sorted({act for act in seen if not act.partition(" ")[2].startswith((*allowed, *COORDINATOR))})
+        strays = sorted({act for act in seen if not act.partition(" ")[2].startswith((*allowed, *COORDINATOR, FBX))})
         report = {
             "acts": len(seen),
             "strays": strays[:20],

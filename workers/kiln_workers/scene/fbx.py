@@ -77,7 +77,7 @@ class _Part:
     material: int
     """Of the mesh's list, which each node fills."""
     raw: RawMesh
-    uv: Mapping[str, Floats]  # [V, 2] by the set's name, in the file's order
+    uv: Mapping[str, Floats]  # [V, 2] by the set's name
     vertex: Ints  # [V] of the mesh's positions
 
 
@@ -144,12 +144,13 @@ class _Reader:
             for index, part in enumerate(parts):
                 own = node["materials"]
                 coat = materials.use(own[part.material] if part.material < len(own) else None)
-                uv = [part.uv.get(title, next(iter(part.uv.values()))) for title in coat.semantics] if part.uv else []
+                first = part.raw.uv
+                uv = [] if first is None else [part.uv.get(title, first) for title in coat.semantics]
                 raw = replace(
                     part.raw,
                     name=f"{name}/{index}" if len(parts) > 1 else name,
                     material=coat.index,
-                    uv=uv[0] if uv else part.raw.uv,
+                    uv=uv[0] if uv else first,
                     more_uv=tuple(uv[1:]),
                 )
                 if mesh["skinned"]:
@@ -190,8 +191,9 @@ class _Reader:
             colours = linearised(clipped[:, :3].astype(np.float32)).astype(np.float64)
             colors = np.concatenate([colours, clipped[:, 3:]], axis=1)
         # v grows upwards in FBX.
-        uv = {name: picked[f"uv{i}"] * [1.0, -1.0] + [0.0, 1.0] for i, name in enumerate(mesh["uv"])}
-        sets = list(uv.values())
+        sets = [picked[f"uv{i}"] * [1.0, -1.0] + [0.0, 1.0] for i in range(len(mesh["uv"]))]
+        # Sets may have no names; of one name the first counts.
+        uv = dict(reversed(list(zip(mesh["uv"], sets, strict=True))))
         raw = RawMesh(
             name="",
             positions=picked["position"],

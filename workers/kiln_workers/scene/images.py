@@ -1,4 +1,4 @@
-"""Decoding of PNG, JPEG, WebP, OpenEXR and Radiance HDR images with OpenImageIO, and of KTX2 (`basis`), from bytes.
+"""Decoding of images from bytes: PNG, JPEG, WebP, BMP, TGA, OpenEXR and Radiance HDR with OpenImageIO, KTX2 (`basis`).
 
 The format is told by the first bytes, not by the file's name, and only these formats are ever given to a decoder.
 OpenImageIO's Python module opens files only, so the bytes pass through a temporary file whose suffix fits the format.
@@ -27,13 +27,20 @@ SIGNATURES: Final[Mapping[str, bytes]] = {
     "exr": b"\x76\x2f\x31\x01",
     "hdr": b"#?",
     "webp": b"RIFF",
+    "bmp": b"BM",
     "ktx2": b"\xabKTX 20\xbb\r\n\x1a\n",
 }
 HDR_FORMATS: Final = frozenset({"exr", "hdr"})
-LOW_RANGE: Final = frozenset({"png", "jpg", "webp", "ktx2"})
+LOW_RANGE: Final = frozenset({"png", "jpg", "webp", "bmp", "tga", "ktx2"})
 """Formats whose colours are encoded as sRGB says."""
-DECODERS: Final[Mapping[str, str]] = {"png": "png", "jpg": "jpeg", "exr": "openexr", "hdr": "hdr", "webp": "webp"}
+DECODERS: Final[Mapping[str, str]] = {name: name for name in ("png", "webp", "bmp", "hdr")} | {
+    "jpg": "jpeg",
+    "tga": "targa",
+    "exr": "openexr",
+}
 """OpenImageIO's names of the formats."""
+TGA_KINDS: Final = frozenset({1, 2, 3, 9, 10, 11})
+"""With a palette, of colours, grey; and these compressed."""
 
 # What a decoder refuses is not offered to the fifty others.
 oiio.attribute("try_all_readers", 0)
@@ -50,7 +57,17 @@ class Decoded:
 def image_format(data: bytes) -> str | None:
     """The format that the first bytes tell, None for any other."""
     kind = next((name for name, magic in SIGNATURES.items() if data.startswith(magic)), None)
+    if kind is None and _is_tga(data):
+        return "tga"
     return None if kind == "webp" and data[8:12] != b"WEBP" else kind
+
+
+def _is_tga(data: bytes) -> bool:
+    """Whether the first 18 bytes are a header of TGA, which has no signature (Truevision, 1989)."""
+    if len(data) < 18 or data[1] > 1 or data[2] not in TGA_KINDS or data[16] not in (8, 15, 16, 24, 32):
+        return False
+    width, height = int.from_bytes(data[12:14], "little"), int.from_bytes(data[14:16], "little")
+    return data[17] < 64 and width > 0 and height > 0
 
 
 def decode_image(data: bytes, where: str, most_bytes: int = MAX_IMAGE_BYTES) -> Decoded:
@@ -58,7 +75,7 @@ def decode_image(data: bytes, where: str, most_bytes: int = MAX_IMAGE_BYTES) -> 
     kind = image_format(data)
     if kind is None:
         raise InputError(
-            "is neither PNG, JPEG, WebP, KTX2, OpenEXR nor Radiance HDR",
+            "is neither PNG, JPEG, WebP, BMP, TGA, KTX2, OpenEXR nor Radiance HDR",
             where=where,
             remedy="Convert it to one of these.",
         )
