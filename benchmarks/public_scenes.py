@@ -30,7 +30,7 @@ from kiln_workers.shade.image_files import write_picture
 from kiln_workers.shade.image_metrics import flip
 from kiln_workers.shade.package import read_exr
 
-SUFFIXES: Final = {".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".xml"}
+SUFFIXES: Final = {".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".dae", ".fbx", ".xml"}
 SIZE: Final = "480x360"
 
 

@@ -75,7 +75,10 @@ def root(version: Annotated[bool, typer.Option("--version", help="Print the vers
 def bake(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the package.")],
     scene: Annotated[
-        str | None, typer.Argument(metavar="SCENE", help="GLB, glTF, OBJ, PLY or Mitsuba XML; or gallery, courtyard.")
+        str | None,
+        typer.Argument(
+            metavar="SCENE", help="glTF, FBX, DAE, OBJ, PLY, STL, OFF or Mitsuba XML; or gallery, courtyard."
+        ),
     ] = None,
     env: options.Environment = None,
     env_scale: options.EnvironmentScale = 1.0,

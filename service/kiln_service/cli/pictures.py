@@ -56,7 +56,7 @@ def shade(
 
 
 def reference(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="GLB, glTF, OBJ, PLY or Mitsuba XML.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="glTF, FBX, DAE, OBJ, PLY, STL, OFF or Mitsuba XML.")],
     camera: Camera,
     out: Out,
     env: options.Environment = None,

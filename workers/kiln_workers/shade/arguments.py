@@ -23,7 +23,7 @@ def add_commands(commands: Any) -> None:
     shading.set_defaults(command=_run_shade)
 
     tracing = commands.add_parser("reference", help="path-trace a scene and state the picture's noise")
-    tracing.add_argument("scene", type=Path, help="GLB, glTF, OBJ, PLY or Mitsuba XML")
+    tracing.add_argument("scene", type=Path, help="glTF, FBX, DAE, OBJ, PLY, STL, OFF or Mitsuba XML")
     _common(tracing)
     tracing.add_argument("--env", type=Path, help="equirectangular HDR or EXR")
     tracing.add_argument("--env-scale", type=float, default=1.0)

@@ -1,7 +1,7 @@
 // Upload the files one by one, then submit the job that they make. What is wrong is said at the field that it is about.
 const form = document.getElementById("submit");
 const field = (id) => document.getElementById(id);
-const SCENES = [".glb", ".gltf", ".obj", ".ply", ".xml"];
+const SCENES = [".glb", ".gltf", ".fbx", ".dae", ".obj", ".ply", ".stl", ".off", ".xml"];
 const FIELDS = {
   "gates.log_mse_rel": "log_mse_rel",
   "gates.visibility_log_mse_rel": "visibility_log_mse_rel",
