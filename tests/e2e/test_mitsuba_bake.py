@@ -58,9 +58,9 @@ SCENE = f"""<scene version="3.0.0">
   <bsdf type="twosided" id="red"><bsdf type="diffuse">
     <spectrum name="reflectance" value="400:0.05, 550:0.1, 600:0.6, 700:0.7"/></bsdf></bsdf>
   <bsdf type="roughplastic" id="blue"><rgb name="diffuse_reflectance" value="0.1 0.2 0.6"/>
-    <float name="alpha" value="0.3"/></bsdf>
+    <string name="distribution" value="ggx"/><float name="alpha" value="0.3"/></bsdf>
   <bsdf type="twosided" id="screen"><bsdf type="roughconductor"><string name="material" value="Al"/>
-    <float name="alpha" value="0.4"/></bsdf></bsdf>
+    <string name="distribution" value="ggx"/><float name="alpha" value="0.4"/></bsdf></bsdf>
 </scene>"""
 
 
@@ -99,20 +99,18 @@ def pictures(baked: tuple[Baked, Path]) -> tuple[Picture, Picture]:
     return ours.astype(np.float64), theirs[..., :3]
 
 
-def test_the_notes_name_what_is_approximated(baked: tuple[Baked, Path]) -> None:
-    notes = " ".join(baked[0].prepared.notes)
-    for part in ("Integrator 'path' ignored", "'roughplastic'", "'roughconductor'"):
-        assert part in notes, part
+def test_what_the_bake_does_without_is_noted(baked: tuple[Baked, Path]) -> None:
+    assert any("Integrator 'path' ignored" in note for note in baked[0].prepared.notes)
     assert baked[0].prepared.has_environment
 
 
 def test_the_shaded_package_has_the_colours_of_mitsubas_picture(pictures: tuple[Picture, Picture]) -> None:
     ours, theirs = pictures
     ratio = ours.mean(axis=(0, 1)) / theirs.mean(axis=(0, 1))
-    assert np.abs(ratio - 1.0).max() < 0.06, ratio
+    assert np.abs(ratio - 1.0).max() < 0.03, ratio
     for half in (slice(0, SIZE[0] // 2), slice(SIZE[0] // 2, None)):
         ratio = ours[:, half].mean(axis=(0, 1)) / theirs[:, half].mean(axis=(0, 1))
-        assert np.abs(ratio - 1.0).max() < 0.1, ratio
+        assert np.abs(ratio - 1.0).max() < 0.05, ratio
 
 
 def test_left_is_left(pictures: tuple[Picture, Picture]) -> None:

@@ -17,14 +17,14 @@ from kiln_workers.scene.bundle import BundleFolder
 from kiln_workers.scene.collada_document import Collada, name_of
 from kiln_workers.scene.collada_geometry import Part, geometry_parts
 from kiln_workers.scene.collada_lights import read_light
-from kiln_workers.scene.collada_materials import Coat, Materials, is_double_sided
+from kiln_workers.scene.collada_materials import Materials, is_double_sided
 from kiln_workers.scene.collada_nodes import Placed, placed_nodes
 from kiln_workers.scene.collada_skins import Joints, Skin, read_skin
 from kiln_workers.scene.geometry import Floats, RawMesh, check_mesh_count, check_triangle_count, place, unique_names
 from kiln_workers.scene.gltf_deform import skinned
 from kiln_workers.scene.limits import MAX_TEXT_BYTES, NAME_LENGTH
 from kiln_workers.scene.model import Mesh, PunctualLight, Scene
-from kiln_workers.scene.texture_files import TextureFiles
+from kiln_workers.scene.texture_files import Coat, TextureFiles
 from kiln_workers.scene.xml_nodes import Node
 
 MORE_UV: Final = 1

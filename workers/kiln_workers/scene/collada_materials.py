@@ -14,23 +14,13 @@ import numpy as np
 from kiln_workers.scene.collada_document import Collada, name_of
 from kiln_workers.scene.limits import MAX_UV_SETS, check_count
 from kiln_workers.scene.model import Material, TextureRef
-from kiln_workers.scene.texture_files import TextureFiles, luminance
+from kiln_workers.scene.texture_files import Coat, TextureFiles, luminance
 from kiln_workers.scene.xml_nodes import Node
 
 SHADERS: Final = ("phong", "blinn", "lambert", "constant")
 WRAP: Final = {"WRAP": "repeat", "MIRROR": "mirror", "CLAMP": "clamp", "BORDER": "clamp", "NONE": "clamp"}
 WHITE: Final = (1.0, 1.0, 1.0, 1.0)
 Colour = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class Coat:
-    """A material as a mesh needs it."""
-
-    index: int
-    """In the scene's materials."""
-    semantics: tuple[str, ...] = ()
-    """What its textures call their UV sets, in the order that `TextureRef.uv_set` counts."""
 
 
 @dataclass

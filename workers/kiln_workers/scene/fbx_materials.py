@@ -12,11 +12,10 @@ import numpy as np
 
 from kiln_schemas.errors import InputError
 from kiln_schemas.text import told
-from kiln_workers.scene.collada_materials import Coat
 from kiln_workers.scene.container import Array
 from kiln_workers.scene.limits import MAX_UV_SETS, NAME_LENGTH, check_count
 from kiln_workers.scene.model import Material, TextureRef
-from kiln_workers.scene.texture_files import TextureFiles, luminance
+from kiln_workers.scene.texture_files import Coat, TextureFiles, luminance
 
 LAMBERT, PHONG = 1, 2
 """ufbx' numbers of the classic shaders; 0 is one that it does not know."""

@@ -25,6 +25,12 @@ REFUSED: Final = 3
 """Status of the process where the file is at fault; the reason is on standard error."""
 DEPTH: Final = 256
 """Nodes in nodes."""
+BLENDER: Final = (2, 3)
+"""ufbx' numbers of Blender's exporters."""
+LOD_GROUP: Final = 16
+"""ufbx' number of this kind of node."""
+HOLD: Final = ctypes.pythonapi.Py_IncRef
+HOLD.argtypes = [ctypes.py_object]
 PBR_MAPS: Final = (
     *("base_factor", "base_color", "roughness", "metalness", "specular_factor", "specular_color", "specular_ior"),
     *("emission_factor", "emission_color", "opacity", "transmission_factor", "coat_factor", "glossiness", "normal_map"),
@@ -77,8 +83,8 @@ class _Extraction:
             raise Refused(f"has {triangles} triangles, at most {MAX_TRIANGLES} are read")
         body = {
             "unit": _number(_get(scene, "settings", "original_unit_meters")),
-            "blender": int(_get(scene, "metadata", "exporter")) in (2, 3),
-            "animated": len(_get(scene, "anim_stacks")) > 0 and "AnimCurve" in self._kinds(),
+            "blender": int(_get(scene, "metadata", "exporter")) in BLENDER,
+            "animated": len(_get(scene, "anim_curves")) > 0,
             "curves": len(_get(scene, "line_curves")) + len(_get(scene, "nurbs_curves")),
             "nurbs": len(_get(scene, "nurbs_surfaces")),
             "nodes": [self._node(node) for node in _items(scene, "nodes")],
@@ -89,16 +95,13 @@ class _Extraction:
         }
         return body, self.arrays
 
-    def _kinds(self) -> set[str]:
-        return {"AnimCurve"} if len(_get(self.scene, "anim_curves")) else set()
-
     def _node(self, node: Any) -> dict[str, Any]:
         parent, mesh, light = _get(node, "parent"), _get(node, "mesh"), _get(node, "light")
         return {
             "name": _get(node, "name"),
             "parent": -1 if parent is None else int(_get(parent, "typed_id")),
             "visible": bool(_get(node, "visible")),
-            "lod_group": int(_get(node, "attrib_type")) == 16,
+            "lod_group": int(_get(node, "attrib_type")) == LOD_GROUP,
             "mesh": -1 if mesh is None else int(_get(mesh, "typed_id")),
             "light": -1 if light is None else int(_get(light, "typed_id")),
             "geometry_to_world": _matrix(_get(node, "geometry_to_world")),
@@ -200,10 +203,6 @@ def _held(thing: Any) -> Any:
     HOLD(thing)
     HOLD(thing)
     return thing
-
-
-HOLD: Final = ctypes.pythonapi.Py_IncRef
-HOLD.argtypes = [ctypes.py_object]
 
 
 def _get(thing: Any, *names: str) -> Any:

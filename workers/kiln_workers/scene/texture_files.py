@@ -21,6 +21,16 @@ from kiln_workers.scene.model import Float32, Image, Material, TextureRef
 LUMINANCE: Final = np.array([0.212671, 0.715160, 0.072169], np.float32)
 
 
+@dataclass(frozen=True)
+class Coat:
+    """A material as a mesh needs it."""
+
+    index: int
+    """In the scene's materials."""
+    semantics: tuple[str, ...] = ()
+    """What its textures call their UV sets, in the order that `TextureRef.uv_set` counts."""
+
+
 @dataclass
 class TextureFiles:
     """The images of a scene in the order of first use."""
