@@ -10,6 +10,7 @@ import pytest
 from kiln_schemas.errors import InputError, TooLarge
 from kiln_service.cli.bundle import collect
 from kiln_workers.scene.fbx_bounds import check_inflation, inflated_bytes
+from kiln_workers.scene.file_camera import file_camera
 from kiln_workers.scene.geometry import face_areas
 from kiln_workers.scene.load import load_scene
 from kiln_workers.scene.model import LightKind
@@ -413,6 +414,24 @@ def test_hidden_nodes_and_further_levels_of_detail_are_left_out(tmp_path):
     scene = load(tmp_path, document(objects, [*links, *((GEOMETRY, number) for number in (202, 203, 204, 205))]))
     assert [each.name for each in scene.meshes] == ["fine"]
     assert "further levels of detail left out" in " ".join(scene.notes)
+
+
+def test_the_camera_of_an_fbx_file(tmp_path):
+    """It looks along +X of its node, which is turned by 90 degrees about +Z; the field of view is vertical."""
+    own = properties(FieldOfView=40, ApertureMode=2, AspectWidth=3, AspectHeight=2)
+    objects = [
+        f'NodeAttribute: 501, "NodeAttribute::c", "Camera" {{ TypeFlags: "Camera"\n{own} }}',
+        model(201, "c", "Camera", Lcl_Translation=[1, 2, 3], Lcl_Rotation=[0, 0, 90]),
+    ]
+    for world in ("Z up, metres", "Y up, centimetres"):
+        *_, columns = WORLD[world]
+        camera = file_camera(document(objects, [(201, 0), (501, 201)], world).encode(), "a.fbx")
+        assert camera is not None
+        np.testing.assert_allclose(camera.position, columns @ [1, 2, 3], atol=1e-9)
+        forward = columns @ [0, 1, 0] / np.linalg.norm(columns @ [0, 1, 0])
+        np.testing.assert_allclose(np.subtract(camera.target, camera.position), forward, atol=1e-9)
+        np.testing.assert_allclose(camera.up, columns @ [-1, 0, 0] / np.linalg.norm(columns @ [1, 0, 0]), atol=1e-9)
+        assert camera.fov_deg == pytest.approx(40)
 
 
 def test_lights_without_a_counterpart_are_noted(tmp_path):

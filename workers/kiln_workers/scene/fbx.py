@@ -48,10 +48,14 @@ MAX_JOINTS: Final = 64
 def read_fbx(folder: Path, entry: str) -> Scene:
     """The scene of an FBX file of the bundle `folder`."""
     bundle = BundleFolder(folder, entry)
-    data = bundle.read(Path(entry).name, "scene")
-    check_inflation(data, entry)
-    body, arrays = unpack(KIND, _in_child(data, entry))
+    body, arrays = parse_fbx(bundle.read(Path(entry).name, "scene"), entry)
     return _Reader(body, arrays, bundle).read()
+
+
+def parse_fbx(data: bytes, entry: str) -> tuple[dict[str, Any], dict[str, Array]]:
+    """What `fbx_native` tells of a file."""
+    check_inflation(data, entry)
+    return unpack(KIND, _in_child(data, entry))
 
 
 def _in_child(data: bytes, entry: str) -> bytes:

@@ -92,11 +92,13 @@ class _Extraction:
             "materials": [self._material(material) for material in _items(scene, "materials")],
             "textures": [self._texture(part, f"t{number}") for number, part in enumerate(_items(scene, "textures"))],
             "lights": [self._light(light) for light in _items(scene, "lights")],
+            "cameras": [self._camera(camera) for camera in _items(scene, "cameras")],
         }
         return body, self.arrays
 
     def _node(self, node: Any) -> dict[str, Any]:
-        parent, mesh, light = _get(node, "parent"), _get(node, "mesh"), _get(node, "light")
+        parent, mesh = _get(node, "parent"), _get(node, "mesh")
+        light, camera = _get(node, "light"), _get(node, "camera")
         return {
             "name": _get(node, "name"),
             "parent": -1 if parent is None else int(_get(parent, "typed_id")),
@@ -104,6 +106,7 @@ class _Extraction:
             "lod_group": int(_get(node, "attrib_type")) == LOD_GROUP,
             "mesh": -1 if mesh is None else int(_get(mesh, "typed_id")),
             "light": -1 if light is None else int(_get(light, "typed_id")),
+            "camera": -1 if camera is None else int(_get(camera, "typed_id")),
             "geometry_to_world": _matrix(_get(node, "geometry_to_world")),
             "node_to_world": _matrix(_get(node, "node_to_world")),
             "materials": [int(_get(part, "typed_id")) for part in _items(node, "materials")],
@@ -195,6 +198,12 @@ class _Extraction:
             "inner": _number(_get(light, "inner_angle")),
             "outer": _number(_get(light, "outer_angle")),
             "on": bool(_get(light, "cast_light")),
+        }
+
+    def _camera(self, camera: Any) -> dict[str, Any]:
+        return {
+            "perspective": int(_get(camera, "projection_mode")) == 0,
+            "fov": _number(_get(camera, "field_of_view_deg")[1]),
         }
 
 

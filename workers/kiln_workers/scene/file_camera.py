@@ -6,12 +6,14 @@ from typing import Final
 
 from kiln_schemas.camera import Camera
 from kiln_workers.scene.collada_camera import collada_camera
+from kiln_workers.scene.fbx_camera import fbx_camera
 from kiln_workers.scene.gltf_camera import gltf_camera
 
 CAMERAS: Final[Mapping[str, Callable[[bytes, str], Camera | None]]] = {
     ".glb": gltf_camera,
     ".gltf": gltf_camera,
     ".dae": collada_camera,
+    ".fbx": fbx_camera,
 }
 
 
