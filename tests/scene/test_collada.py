@@ -322,6 +322,24 @@ def test_emission_constant_and_sides(tmp_path):
     assert paint.emission == (3.0, 2.0, 1.0) and paint.base_color[:3] == (0.0, 0.0, 0.0) and paint.double_sided
 
 
+def test_what_exporters_add_to_a_texture(tmp_path, write_image):
+    """Maya's repetition and offset, v upwards; a bump that is a normal map."""
+    write_image(tmp_path / "a.png", np.full((2, 2, 3), [128, 128, 255], np.uint8))
+    laid_out = """<texture texture="sampler" texcoord="second"><extra><technique profile="MAYA"><repeatU>2</repeatU>
+      <repeatV>3</repeatV><offsetU>0.25</offsetU><offsetV>0.5</offsetV></technique></extra></texture>"""
+    bump = f"""<extra><technique profile="FCOLLADA"><bump bumptype="NORMALMAP">{TEXTURE}</bump></technique></extra>"""
+    paint = material("paint", f"<lambert><diffuse>{laid_out}</diffuse></lambert>", SAMPLER, bump)
+    nodes = f'<node><instance_geometry url="#quad">{BIND}</instance_geometry></node>'
+    scene = load(tmp_path, document(nodes, materials=(paint,)))
+    (found,) = scene.materials
+    base, normal = found.base_color_texture, found.normal_texture
+    # At (u, v), upwards, Maya reads (2 u + 0.25, 3 v + 0.5).
+    u, v = 0.3, 0.1
+    down = base.scale[0] * u + base.offset[0], base.scale[1] * (1 - v) + base.offset[1]
+    assert down == pytest.approx((2 * u + 0.25, 1 - (3 * v + 0.5)))
+    assert normal is not None and not scene.images[normal.image].srgb and scene.images[base.image].srgb
+
+
 def test_skins_of_collada_are_where_their_joints_put_them(tmp_path):
     """A bar of two joints, the second turned by 90 degrees about its foot at x = 1; under Z_UP and centimetres."""
     points = np.float32([[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 0, 1], [1, 0, 1], [0, 0, 1]]) * 100
