@@ -10,7 +10,7 @@ the error are traced afresh and whole, in two halves. All of these, and the texe
 numbers.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -21,11 +21,12 @@ from kiln_schemas.settings import RenderSettings
 from kiln_workers.fit.field import BetweenPoints, TexelField
 from kiln_workers.render.backend import Device
 from kiln_workers.render.tile import Progress, TexelBatch, TileRenderer, silent
+from kiln_workers.scene.bands import bands
+from kiln_workers.scene.geometry import Floats
 from kiln_workers.scene.model import Float32, Scene
-from kiln_workers.scene.push_out import push_out
 from kiln_workers.scene.raster import touched_squares
-from kiln_workers.scene.texel_map import TexelMap, TexelState
-from kiln_workers.scene.texels import rasterise_texels
+from kiln_workers.scene.texel_map import TexelMap, TexelState, joined
+from kiln_workers.scene.texels import TexelMaker
 from kiln_workers.store.layout import BETWEEN_STEPS, sparse_offsets
 
 Float16 = npt.NDArray[np.float16]
@@ -38,23 +39,37 @@ SPARSE_SEQUENCE: Final = 7
 
 def between_maps(scene: Scene, texel_map: TexelMap, device: Device = "auto") -> tuple[TexelMap, ...]:
     """One texel map for each of BETWEEN_STEPS: a texel that is VALID there stands for the point a step from its own."""
-    made = []
-    for step in BETWEEN_STEPS:
-        moved, usable = _moved_map(scene, texel_map, step, device)
-        usable &= _between_one_chart(texel_map, step)
-        made.append(replace(moved, state=np.where(usable, TexelState.VALID, TexelState.GUTTER).astype(np.uint8)))
-    return tuple(made)
+    return tuple(joined(between_bands(scene, texel_map, step, device)) for step in BETWEEN_STEPS)
 
 
-def _between_one_chart(texel_map: TexelMap, step: tuple[int, int]) -> Bools:
-    """Texels [H, W] from which a step leads to a point whose corners are all valid and of one chart."""
+def between_bands(
+    scene: Scene, texel_map: TexelMap, step: tuple[int, int], device: Device = "auto"
+) -> Iterator[TexelMap]:
+    """The map of one of BETWEEN_STEPS in bands of rows, top to bottom; `texel_map` may lie in a file."""
+    shape = (texel_map.state.shape[0], texel_map.state.shape[1])
+    moved_to = moved_scene(scene, step, shape)
+    maker = TexelMaker(moved_to, shape[0], device)
+    corners = np.concatenate([_uv(mesh.lightmap_uv)[mesh.faces] for mesh in moved_to.meshes])
+    corners = corners * [shape[1], shape[0]]
+    for rows in bands(shape):
+        moved, usable = _moved_rows(maker, corners, texel_map, rows)
+        usable &= _between_one_chart(texel_map.rows(slice(rows.start, rows.stop + 1)), step, len(usable))
+        yield replace(moved, state=np.where(usable, TexelState.VALID, TexelState.GUTTER).astype(np.uint8))
+        texel_map.release()
+
+
+def _between_one_chart(texel_map: TexelMap, step: tuple[int, int], rows: int) -> Bools:
+    """Texels [rows, W] from which a step leads to a point whose corners are all valid and of one chart.
+
+    The map has these rows and the next one, if there is one.
+    """
     chart = np.where(texel_map.state == TexelState.VALID, texel_map.chart, -1)
     height, width = chart.shape
-    padded = np.full((height + 1, width + 1), -1, chart.dtype)
+    padded = np.full((rows + 1, width + 1), -1, chart.dtype)
     padded[:height, :width] = chart
-    out = chart >= 0
+    out = chart[:rows] >= 0
     for down, right in ((step[0], 0), (0, step[1]), step):
-        out &= padded[down : down + height, right : right + width] == chart
+        out &= padded[down : down + rows, right : right + width] == chart[:rows]
     return out
 
 
@@ -156,21 +171,19 @@ def moved_scene(scene: Scene, step: tuple[int, int], shape: tuple[int, int]) -> 
     return replace(scene, meshes=tuple(meshes))
 
 
-def _moved_map(scene: Scene, texel_map: TexelMap, step: tuple[int, int], device: Device) -> tuple[TexelMap, Bools]:
-    """The texel map of the moved scene, and which of its texels [H, W] are points that count."""
-    shape = (texel_map.state.shape[0], texel_map.state.shape[1])
-    moved_to = moved_scene(scene, step, shape)
-    rasterised = rasterise_texels(moved_to, shape[0], device)
-    pushed = push_out(moved_to, rasterised, device)
-    corners = np.concatenate([_uv(mesh.lightmap_uv)[mesh.faces] for mesh in moved_to.meshes])
-    touched = touched_squares(corners * [shape[1], shape[0]], shape[1], shape[0])
-    inside = np.zeros(texel_map.state.size, bool)
-    inside[touched.square[touched.distance == 0.0]] = True
+def _moved_rows(maker: TexelMaker, corners: Floats, texel_map: TexelMap, rows: slice) -> tuple[TexelMap, Bools]:
+    """Rows of the texel map of the moved scene, and which of its texels are points that count."""
+    rasterised = maker.rasterised(rows)
+    pushed = maker.push_out(rasterised)
+    here = texel_map.rows(rows)
+    touched = touched_squares(corners, maker.shape[1], maker.shape[0], rows=rows)
+    inside = np.zeros(here.state.size, bool)
+    inside[touched.square[touched.distance == 0.0] - rows.start * maker.shape[1]] = True
     usable = (
-        inside.reshape(shape)
+        inside.reshape(here.state.shape)
         & (rasterised.state == TexelState.VALID)
-        & (rasterised.mesh == texel_map.mesh)
-        & (rasterised.chart == texel_map.chart)
+        & (rasterised.mesh == here.mesh)
+        & (rasterised.chart == here.chart)
         & (pushed.position == rasterised.position).all(axis=-1)
     )
     return pushed, usable

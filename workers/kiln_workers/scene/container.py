@@ -7,8 +7,9 @@ reading (no pickle), and nothing is allocated beyond the bytes that are there: a
 
 import json
 import math
+import mmap
 from collections.abc import Iterator, Mapping
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,21 +26,39 @@ MAX_HEADER_BYTES: Final = 256 << 20
 
 def chunks(kind: str, body: Mapping[str, Any], arrays: Mapping[str, Array]) -> Iterator[bytes]:
     """The container's bytes in pieces; `kind` tells containers of different content apart."""
-    table: dict[str, Any] = {}
-    offset = 0
     stored = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    for name, array in stored.items():
-        if array.dtype.str not in DTYPES:
-            raise TypeError(f"array '{name}' of {array.dtype} has no place in a container")
-        table[name] = {"dtype": array.dtype.str, "shape": list(array.shape), "offset": offset}
-        offset += _padded(array.nbytes)
+    yield _head(kind, body, {name: (array.dtype.str, array.shape) for name, array in stored.items()})[0]
+    for array in stored.values():
+        yield array.tobytes() + b"\0" * (_padded(array.nbytes) - array.nbytes)
+
+
+def write_frame(
+    file: BinaryIO, kind: str, body: Mapping[str, Any], arrays: Mapping[str, tuple[str, tuple[int, ...]]]
+) -> dict[str, int]:
+    """Write a container of zeros for arrays of a dtype and shape; where in the file each of them begins."""
+    head, offsets, end = _head(kind, body, arrays)
+    file.write(head)
+    file.truncate(len(head) + end)
+    return {name: len(head) + offset for name, offset in offsets.items()}
+
+
+def _head(
+    kind: str, body: Mapping[str, Any], arrays: Mapping[str, tuple[str, tuple[int, ...]]]
+) -> tuple[bytes, dict[str, int], int]:
+    """What comes before the arrays; where each of them begins after that, and where the last one ends."""
+    table: dict[str, Any] = {}
+    end = 0
+    for name, (dtype, shape) in arrays.items():
+        if dtype not in DTYPES:
+            raise TypeError(f"array '{name}' of {dtype} has no place in a container")
+        table[name] = {"dtype": dtype, "shape": list(shape), "offset": end}
+        end += _padded(math.prod(shape) * np.dtype(dtype).itemsize)
     header = json.dumps(
         {"kind": kind, "body": body, "arrays": table}, sort_keys=True, separators=(",", ":"), allow_nan=False
     ).encode()
     header += b" " * (_padded(len(MAGIC) + 8 + len(header)) - len(MAGIC) - 8 - len(header))
-    yield MAGIC + len(header).to_bytes(8, "little") + header
-    for array in stored.values():
-        yield array.tobytes() + b"\0" * (_padded(array.nbytes) - array.nbytes)
+    offsets = {name: int(entry["offset"]) for name, entry in table.items()}
+    return MAGIC + len(header).to_bytes(8, "little") + header, offsets, end
 
 
 def pack(kind: str, body: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
@@ -47,7 +66,7 @@ def pack(kind: str, body: Mapping[str, Any], arrays: Mapping[str, Array]) -> byt
     return b"".join(chunks(kind, body, arrays))
 
 
-def unpack(kind: str, data: bytes) -> tuple[dict[str, Any], dict[str, Array]]:
+def unpack(kind: str, data: bytes | mmap.mmap) -> tuple[dict[str, Any], dict[str, Array]]:
     """Body and arrays (read-only views); InputError if the bytes are not a container of this kind."""
     start = len(MAGIC) + 8
     length = int.from_bytes(data[len(MAGIC) : start], "little")
@@ -64,7 +83,7 @@ def unpack(kind: str, data: bytes) -> tuple[dict[str, Any], dict[str, Array]]:
     return body, arrays
 
 
-def _view(kind: str, data: bytes, start: int, entry: Mapping[str, Any]) -> Array:
+def _view(kind: str, data: bytes | mmap.mmap, start: int, entry: Mapping[str, Any]) -> Array:
     shape = tuple(int(side) for side in entry["shape"])
     offset = int(entry["offset"])
     if entry["dtype"] not in DTYPES or min(shape, default=0) < 0 or offset < 0 or len(shape) > 4:

@@ -32,18 +32,19 @@ SURFACE_TEXELS: Final = 0.25
 """A candidate lies no further than this above the mesh that its texel belongs to."""
 
 
-def push_out(scene: Scene, texels: TexelMap, device: Device = "auto") -> TexelMap:
-    """The map with points that see back faces along the surface moved out, where there is a place to go."""
+def push_out(texels: TexelMap, triangles: "BareTriangles") -> TexelMap:
+    """The map with points that see back faces along the surface moved out, where there is a place to go.
+
+    `texels` may be some rows of the light map: no point depends on another. `triangles` are the whole scene's.
+    """
     row, column = np.nonzero(texels.state == TexelState.VALID)
-    if not len(row):
-        return texels
     points = _Points(
         texels.position[row, column].astype(np.float64),
         texels.normal[row, column].astype(np.float64),
         texels.texel_size[row, column].astype(np.float64),
         texels.mesh[row, column].astype(np.int64),
     )
-    moved, place = _free_places(BareTriangles(scene, device), points)
+    moved, place = _free_places(triangles, points)
     out = texels.position.copy()
     out[row[moved], column[moved]] = place
     return replace(texels, position=out)

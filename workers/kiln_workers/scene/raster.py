@@ -13,7 +13,9 @@ import numpy as np
 
 from kiln_workers.scene.geometry import Floats, Ints
 
-BATCH_SQUARES: Final = 1 << 20
+BATCH_SQUARES: Final = 1 << 18
+OVERLAP_SQUARES: Final = 1 << 20
+"""Squares at once of `touching_squares`, whose result does not depend on it, and of `interior_samples`, whose does."""
 TOUCH: Final = 1e-5
 """Squares by which a triangle must reach into a square to touch it: rounding of a shared border is no touch."""
 
@@ -28,36 +30,45 @@ class Touched:
     distance: Floats  # [S] from the centre to that point; 0 where the triangle contains the centre
 
 
-def touched_squares(corners: Floats, width: int, height: int, handicap: Floats | None = None) -> Touched:
+def touched_squares(
+    corners: Floats, width: int, height: int, handicap: Floats | None = None, rows: slice | None = None
+) -> Touched:
     """For every square that a triangle of `corners` [F, 3, 2] touches: the nearest to its centre, and its point there.
 
     A triangle that contains the centre wins with distance 0; among equals the first triangle wins. `handicap` [F] is
-    added to a triangle's distance when it competes with others.
+    added to a triangle's distance when it competes with others. With `rows`, only the squares of these rows.
     """
+    first, last = (0, height) if rows is None else (rows.start, rows.stop)
     added = np.zeros(len(corners)) if handicap is None else handicap
-    best_rank = np.full(width * height, np.inf)
-    best_distance = np.full(width * height, np.inf)
-    best_face = np.full(width * height, -1, dtype=np.int64)
-    best_barycentric = np.zeros((width * height, 3))
-    for face, column, row in touching_squares(corners, width, height):
-        square = row * width + column
+    count = width * (last - first)
+    best_rank = np.full(count, np.inf)
+    best_distance = np.full(count, np.inf)
+    best_face = np.full(count, -1, dtype=np.int64)
+    best_barycentric = np.zeros((count, 3))
+    for face, column, row in touching_squares(corners, width, height, rows):
+        square = (row - first) * width + column
         centre = np.stack([column + 0.5, row + 0.5], axis=1)
         barycentric, distance = closest_point(corners[face], centre)
         rank = distance + added[face]
         order = np.lexsort((face, rank, square))
-        first = order[np.unique(square[order], return_index=True)[1]]
-        better = first[rank[first] < best_rank[square[first]]]
+        nearest = order[np.unique(square[order], return_index=True)[1]]
+        better = nearest[rank[nearest] < best_rank[square[nearest]]]
         best_rank[square[better]] = rank[better]
         best_distance[square[better]] = distance[better]
         best_face[square[better]] = face[better]
         best_barycentric[square[better]] = barycentric[better]
     square = np.flatnonzero(best_face >= 0)
-    return Touched(square, best_face[square], best_barycentric[square], best_distance[square])
+    return Touched(first * width + square, best_face[square], best_barycentric[square], best_distance[square])
 
 
-def touching_squares(corners: Floats, width: int, height: int) -> Iterator[tuple[Ints, Ints, Ints]]:
+def touching_squares(
+    corners: Floats, width: int, height: int, rows: slice | None = None
+) -> Iterator[tuple[Ints, Ints, Ints]]:
     """(triangle, column, row) for every square that a triangle of `corners` [F, 3, 2] touches, in batches."""
-    for face, column, row in _squares(corners, width, height):
+    first, last = (0, height) if rows is None else (rows.start, rows.stop)
+    near = np.flatnonzero((corners[:, :, 1].min(axis=1) < last) & (corners[:, :, 1].max(axis=1) >= first))
+    for number, column, row in _squares(corners[near], width, (first, last), BATCH_SQUARES):
+        face = near[number]
         keep = _overlaps_square(corners[face], column, row)
         yield face[keep], column[keep], row[keep]
 
@@ -104,28 +115,32 @@ def interior_samples(corners: Floats, size: int, margin: float) -> Iterator[tupl
     lengths = np.linalg.norm(corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]], axis=2)  # edge opposite to each corner
     double_area = np.abs(_cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     height = np.divide(double_area[:, None], lengths, out=np.zeros_like(lengths), where=lengths > 0.0)
-    for face, column, row in _squares(corners, size, size):
+    for face, column, row in _squares(corners, size, (0, size), OVERLAP_SQUARES):
         centre = np.stack([column + 0.5, row + 0.5], axis=1)
         inside = (_signed_barycentrics(corners[face], centre) * height[face] > margin).all(axis=1)
         yield face[inside], row[inside] * size + column[inside]
 
 
-def _squares(corners: Floats, width: int, height: int) -> Iterator[tuple[Ints, Ints, Ints]]:
-    """Triangle, column and row of all squares of the triangles' bounding boxes, in batches, triangles ascending."""
+def _squares(corners: Floats, width: int, between: tuple[int, int], batch: int) -> Iterator[tuple[Ints, Ints, Ints]]:
+    """Triangle, column and row of all squares of the triangles' bounding boxes, triangles ascending.
+
+    Only of the rows from the first of `between` to before the second, about `batch` squares at once.
+    """
     low = np.floor(corners.min(axis=1)).astype(np.int64)
     high = np.floor(corners.max(axis=1)).astype(np.int64) + 1
-    low, high = np.clip(low, 0, [width, height]), np.clip(high, 0, [width, height])
+    least, most = (0, between[0]), (width, between[1])
+    low, high = np.clip(low, least, most), np.clip(high, least, most)
     rows = np.cumsum(np.maximum(high[:, 1] - low[:, 1], 0))
     begin = 0
     while begin < len(corners):
         done = rows[begin - 1] if begin else 0
-        end = max(int(np.searchsorted(rows, done + BATCH_SQUARES, side="right")), begin + 1)
-        for face, column, row in _squares_of_few(low[begin:end], high[begin:end]):
+        end = max(int(np.searchsorted(rows, done + batch, side="right")), begin + 1)
+        for face, column, row in _squares_of_few(low[begin:end], high[begin:end], batch):
             yield face + begin, column, row
         begin = end
 
 
-def _squares_of_few(low: Ints, high: Ints) -> Iterator[tuple[Ints, Ints, Ints]]:
+def _squares_of_few(low: Ints, high: Ints, batch: int) -> Iterator[tuple[Ints, Ints, Ints]]:
     """The same of boxes [F, 2], all of whose rows are held at once."""
     rows = np.maximum(high[:, 1] - low[:, 1], 0)
     span_face = np.repeat(np.arange(len(low)), rows)
@@ -135,7 +150,7 @@ def _squares_of_few(low: Ints, high: Ints) -> Iterator[tuple[Ints, Ints, Ints]]:
     begin = 0
     while begin < len(span_face):
         done = ends[begin - 1] if begin else 0
-        end = max(int(np.searchsorted(ends, done + BATCH_SQUARES, side="right")), begin + 1)
+        end = max(int(np.searchsorted(ends, done + batch, side="right")), begin + 1)
         count = columns[begin:end]
         face = np.repeat(span_face[begin:end], count)
         yield face, _counters(count) + low[face, 0], np.repeat(span_row[begin:end], count)

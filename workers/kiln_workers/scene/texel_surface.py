@@ -22,6 +22,8 @@ SIDE: Final = 4
 """Points along a texel's side at which its normal map is looked up."""
 BLOCK: Final = 1 << 18
 """Texels that are looked up at once: bounds memory."""
+MOST_COPIES_BYTES: Final = 1 << 27
+"""What may be kept of smaller copies of normal maps."""
 BEYOND: Final = 1.0
 """Heights of a triangle by which it is thought to go on at most."""
 
@@ -51,6 +53,7 @@ class TexelSurface:
     face: Ints  # [S]
     weight: Floats  # [S, 3] barycentrics of each texel's point
     flat: Floats  # [F, 3, 2] the faces in the light map, in texels
+    copies: "CopiesOfMaps"
 
     def alpha(self) -> Floats:
         """GGX alpha [S], at least MIN_ALPHA."""
@@ -62,15 +65,12 @@ class TexelSurface:
     def shading_normals(self) -> Floats:
         """Normals [S, 3], not of unit length: interpolated, or the mean of the mapped ones."""
         out = np.zeros((len(self.face), 3))
-        copies = Copies(np.ones((1, 1, 3), np.float32))
         for mesh, rows, squares in self._blocks():
             reference = self.scene.materials[mesh.material].normal_texture
             if reference is None or mesh.tangents is None or mesh.uv_of(reference) is None:
                 out[rows] = squares.interpolated(mesh.normals)
                 continue
-            image = self.scene.images[reference.image]
-            if copies.pixels is not image.pixels:
-                copies = Copies(image.pixels)
+            copies = self.copies.of(self.scene.images[reference.image].pixels)
             out[rows] = _mapped_normals(
                 mesh, squares, copies, reference, self.scene.materials[mesh.material].normal_scale
             )
@@ -86,7 +86,7 @@ class TexelSurface:
         first = np.cumsum([0] + [len(mesh.faces) for mesh in self.scene.meshes])
         order = np.argsort(self.face, kind="stable")
         start = np.searchsorted(self.face[order], first)
-        for number in sorted(range(len(self.scene.meshes)), key=self._normal_image):
+        for number in sorted(np.flatnonzero(np.diff(start)).tolist(), key=self._normal_image):
             mesh = self.scene.meshes[number]
             for at in range(start[number], start[number + 1], BLOCK):
                 rows = order[at : min(at + BLOCK, start[number + 1])]
@@ -157,6 +157,11 @@ class Copies:
             pixels[..., :3] if pixels.shape[2] > 2 else pixels[..., :1].repeat(3, axis=2)
         ]
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the copies that were made."""
+        return sum(pixels.nbytes for pixels in self._levels[1:])
+
     def look_up(self, level: int, reference: TextureRef, uv: Floats) -> Floats:
         """Texels [P, 3] in 0 ... 1 at a mesh's coordinates, of a copy or the smallest there is."""
         while len(self._levels) <= level and max(self._levels[-1].shape[:2]) > 1:
@@ -167,6 +172,21 @@ class Copies:
             self._levels.append(pixels)
         chosen = self._levels[min(level, len(self._levels) - 1)]
         return _unit(look_up(chosen, reference, uv), chosen)
+
+
+class CopiesOfMaps:
+    """The copies of normal maps that were looked up last, at most MOST_COPIES_BYTES of them and one more map's."""
+
+    def __init__(self) -> None:
+        self._kept: list[Copies] = []
+
+    def of(self, pixels: npt.NDArray[np.uint8] | Float32) -> Copies:
+        """A map's copies."""
+        found = next((copies for copies in self._kept if copies.pixels is pixels), None) or Copies(pixels)
+        self._kept = [found] + [copies for copies in self._kept if copies is not found]
+        while sum(copies.nbytes for copies in self._kept[1:]) > MOST_COPIES_BYTES:
+            self._kept.pop()
+        return found
 
 
 def _unit(values: npt.NDArray[np.floating], stored: npt.NDArray[Any]) -> Floats:

@@ -17,6 +17,7 @@ plane, rays towards that wall would start on it, and what is beyond the wall wou
 from the edges, and lies as far above the triangle as float32 needs to tell that it does.
 """
 
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -25,14 +26,15 @@ from scipy.sparse.csgraph import connected_components
 
 from kiln_schemas.errors import InputError
 from kiln_workers.render.backend import Device
+from kiln_workers.scene.bands import bands
 from kiln_workers.scene.container import Array
 from kiln_workers.scene.geometry import Floats, Ints, face_areas, face_normals
 from kiln_workers.scene.model import Mesh, Scene
 from kiln_workers.scene.precision import face_clearance
 from kiln_workers.scene.push_out import BareTriangles, push_out
 from kiln_workers.scene.raster import kept_inside, touched_squares
-from kiln_workers.scene.texel_map import TexelMap, TexelState
-from kiln_workers.scene.texel_surface import TexelSurface
+from kiln_workers.scene.texel_map import TexelMap, TexelState, joined
+from kiln_workers.scene.texel_surface import CopiesOfMaps, TexelSurface
 
 MIN_COSINE: Final = 0.05
 """A shading normal is bent towards the geometric one until their cosine is at least this."""
@@ -45,51 +47,90 @@ NARROW_HANDICAP: Final = 0.2
 
 def build_texel_map(scene: Scene, resolution: int, device: Device = "auto") -> TexelMap:
     """The texel map of a scene whose meshes have light-map UVs, points pushed out of other geometry."""
-    return push_out(scene, rasterise_texels(scene, resolution, device), device)
+    maker = TexelMaker(scene, resolution, device)
+    return joined(maker.pushed(rows) for rows in bands(maker.shape))
 
 
 def rasterise_texels(scene: Scene, resolution: int, device: Device = "auto") -> TexelMap:
     """The texel map before points are pushed out of other geometry."""
-    faces = _AllFaces(scene)
-    sizes, clearance, heights = (
-        faces.texel_size(resolution),
-        face_clearance(faces.positions, faces.corners),
-        faces.heights(),
-    )
-    inset = np.maximum(INSET_TEXELS * sizes, INSET_CLEARANCES * clearance)
-    narrow = 1.0 / (1.0 / np.maximum(heights, 1e-300)).sum(axis=1) < 2.0 * inset
-    handicap = np.where(narrow, NARROW_HANDICAP, 0.0)
-    touched = touched_squares(faces.lightmap_uv * resolution, resolution, resolution, handicap)
-    corner = faces.corners[touched.face]  # [S, 3] rows of the vertex arrays
-    weight = kept_inside(touched.barycentric, heights[touched.face], inset[touched.face])
+    maker = TexelMaker(scene, resolution, device)
+    return joined(maker.rasterised(rows) for rows in bands(maker.shape))
 
-    normal = faces.normal[touched.face]
-    flat = np.einsum("sc,scd->sd", weight, faces.positions[corner])
-    mesh = faces.mesh[touched.face]
-    surface = TexelSurface(scene, touched.face, weight, faces.lightmap_uv * resolution)
-    shading = surface.shading_normals()
-    size = sizes[touched.face]
-    lift = terminator_offset(flat, weight, faces.positions[corner], faces.normals[corner])
-    position = flat + clearance[touched.face, None] * normal
-    position += _free_lift(scene, position, lift, 0.5 * size, device)
 
-    grid = (resolution, resolution)
+class TexelMaker:
+    """Makes the texel map of a scene some rows at a time; no texel depends on another."""
 
-    def spread(values: Floats | Ints, dtype: type, empty: int = 0) -> Array:
-        out = np.full((resolution * resolution, *values.shape[1:]), empty, dtype=dtype)
-        out[touched.square] = values
-        return out.reshape(*grid, *values.shape[1:])
+    def __init__(self, scene: Scene, resolution: int, device: Device = "auto") -> None:
+        self.shape: Final = (resolution, resolution)
+        self._scene, self._device = scene, device
+        self._faces = faces = _AllFaces(scene)
+        self._flat = faces.lightmap_uv * resolution
+        self._sizes, self._heights = faces.texel_size(resolution), faces.heights()
+        self._clearance = face_clearance(faces.positions, faces.corners)
+        self._inset = np.maximum(INSET_TEXELS * self._sizes, INSET_CLEARANCES * self._clearance)
+        narrow = 1.0 / (1.0 / np.maximum(self._heights, 1e-300)).sum(axis=1) < 2.0 * self._inset
+        self._handicap = np.where(narrow, NARROW_HANDICAP, 0.0)
+        self._charts = faces.charts()
+        self._copies = CopiesOfMaps()
 
-    return TexelMap(
-        state=spread(np.full(len(mesh), TexelState.VALID), np.uint8),
-        position=spread(position, np.float32),
-        normal=spread(normal, np.float32),
-        shading_normal=spread(bent_normals(shading, normal), np.float32),
-        alpha=spread(surface.alpha(), np.float32),
-        texel_size=spread(size, np.float32),
-        mesh=spread(mesh, np.int32, -1),
-        chart=spread(faces.charts()[touched.face], np.int32, -1),
-    )
+    @cached_property
+    def triangles(self) -> BareTriangles:
+        """The scene for rays; made when the first ray is traced."""
+        return BareTriangles(self._scene, self._device)
+
+    def pushed(self, rows: slice) -> TexelMap:
+        """These rows of the texel map, points pushed out of other geometry."""
+        return self.push_out(self.rasterised(rows))
+
+    def push_out(self, texels: TexelMap) -> TexelMap:
+        """Rows of the map with their points pushed out of other geometry."""
+        return push_out(texels, self.triangles) if texels.covered else texels
+
+    def rasterised(self, rows: slice) -> TexelMap:
+        """These rows of the texel map before that."""
+        faces, width = self._faces, self.shape[1]
+        touched = touched_squares(self._flat, width, self.shape[0], self._handicap, rows)
+        corner = faces.corners[touched.face]  # [S, 3] rows of the vertex arrays
+        weight = kept_inside(touched.barycentric, self._heights[touched.face], self._inset[touched.face])
+
+        normal = faces.normal[touched.face]
+        flat = np.einsum("sc,scd->sd", weight, faces.positions[corner])
+        mesh = faces.mesh[touched.face]
+        surface = TexelSurface(self._scene, touched.face, weight, self._flat, self._copies)
+        shading = surface.shading_normals()
+        size = self._sizes[touched.face]
+        lift = terminator_offset(flat, weight, faces.positions[corner], faces.normals[corner])
+        position = flat + self._clearance[touched.face, None] * normal
+        position += self._free_lift(position, lift, 0.5 * size)
+
+        grid = (rows.stop - rows.start, width)
+
+        def spread(values: Floats | Ints, dtype: type, empty: int = 0) -> Array:
+            out = np.full((grid[0] * grid[1], *values.shape[1:]), empty, dtype=dtype)
+            out[touched.square - rows.start * width] = values
+            return out.reshape(*grid, *values.shape[1:])
+
+        return TexelMap(
+            state=spread(np.full(len(mesh), TexelState.VALID), np.uint8),
+            position=spread(position, np.float32),
+            normal=spread(normal, np.float32),
+            shading_normal=spread(bent_normals(shading, normal), np.float32),
+            alpha=spread(surface.alpha(), np.float32),
+            texel_size=spread(size, np.float32),
+            mesh=spread(mesh, np.int32, -1),
+            chart=spread(self._charts[touched.face], np.int32, -1),
+        )
+
+    def _free_lift(self, position: Floats, lift: Floats, longest: Floats) -> Floats:
+        """Offsets [S, 3] cut to `longest` [S] metres, and to half of the way to the first surface they would meet."""
+        length = np.linalg.norm(lift, axis=1)
+        moved = np.flatnonzero(length > 0.0)
+        out = np.zeros_like(lift)
+        if len(moved):
+            direction, reach = lift[moved] / length[moved, None], np.minimum(length[moved], longest[moved])
+            met = self.triangles.nearest(position[moved], direction, 2.0 * reach).distance
+            out[moved] = direction * np.minimum(reach, 0.5 * met)[:, None]
+        return out
 
 
 def terminator_offset(position: Floats, weight: Floats, corners: Floats, normals: Floats) -> Floats:
@@ -100,18 +141,6 @@ def terminator_offset(position: Floats, weight: Floats, corners: Floats, normals
     """
     below = np.minimum(0.0, np.einsum("scd,scd->sc", position[:, None] - corners, normals))
     return np.asarray(-np.einsum("sc,scd->sd", weight * below, normals))
-
-
-def _free_lift(scene: Scene, position: Floats, lift: Floats, longest: Floats, device: Device) -> Floats:
-    """Offsets [S, 3] cut to `longest` [S] metres, and to half of the way to the first surface that they would meet."""
-    length = np.linalg.norm(lift, axis=1)
-    moved = np.flatnonzero(length > 0.0)
-    out = np.zeros_like(lift)
-    if len(moved):
-        direction, reach = lift[moved] / length[moved, None], np.minimum(length[moved], longest[moved])
-        met = BareTriangles(scene, device).nearest(position[moved], direction, 2.0 * reach).distance
-        out[moved] = direction * np.minimum(reach, 0.5 * met)[:, None]
-    return out
 
 
 def bent_normals(shading: Floats, geometric: Floats) -> Floats:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Final
 
 from kiln_schemas.errors import InputError, TooLarge
@@ -10,20 +11,28 @@ from kiln_schemas.job import check_bundle
 from kiln_schemas.settings import BakeSettings, Function, PackagedScene, Solver
 from kiln_schemas.tasks import MOST_NOTES, MOST_PLACEMENTS, MOST_TILES, PreparePayload, PrepareResult
 from kiln_workers.package.original import check_original
-from kiln_workers.render.between import between_maps
+from kiln_workers.render.between import between_bands
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import pack_scene, scene_hash
 from kiln_workers.scene.atlas import make_lightmap
+from kiln_workers.scene.bands import bands
 from kiln_workers.scene.lamps import lamp_notes
 from kiln_workers.scene.limits import LAYOUT_S, deadline
 from kiln_workers.scene.load import check_light, load_scene
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.sheets import part_sheets
-from kiln_workers.scene.texel_map import COARSE, SPECK, TexelMap, pack_texel_map, speck_share
-from kiln_workers.scene.texels import build_texel_map
+from kiln_workers.scene.texel_map import (
+    COARSE,
+    SPECK,
+    TexelMap,
+    open_texel_map,
+    speck_share,
+    write_texel_map,
+)
+from kiln_workers.scene.texels import TexelMaker
 from kiln_workers.stages.bundle import lay_out
 from kiln_workers.stages.tiles import plan_tiles
-from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
+from kiln_workers.store.layout import BETWEEN_STEPS, TEXEL_MAP_ARRAYS
 from kiln_workers.store.light_field import LightFieldStore
 
 STEPS: Final = (
@@ -57,7 +66,8 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         lightmap = make_lightmap(scene, settings.lightmap, may_cut=not original)
         scene = lightmap.scene
         step(3)
-        texel_map = build_texel_map(scene, lightmap.resolution)
+        path = _texel_map_file(scene, lightmap.resolution, context)
+    texel_map = open_texel_map(path)
     tiles = plan_tiles(texel_map, settings.lightmap.tile)
     if not tiles:
         raise InputError(
@@ -72,18 +82,19 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
             remedy="Raise lightmap.tile or lower lightmap.resolution.",
         )
     step(4)
-    between = between_maps(scene, texel_map) if traces_between(settings) else ()
+    between = _put_between(scene, texel_map, context) if traces_between(settings) else ()
     fine_side = settings.lightmap.irradiance_side(lightmap.resolution)
-    fine = build_texel_map(scene, fine_side) if fine_side > lightmap.resolution else None
+    finer = fine_side > lightmap.resolution
+    fine = context.put_blob(_texel_map_file(scene, fine_side, context)) if finer else None
     step(5)
     digest = scene_hash(scene, settings.render)
     _create_store(payload.store_url, scene, texel_map, digest, settings)
     context.log(f"{scene.triangles} triangles, {texel_map.covered} texels in {len(tiles)} tiles")
     return PrepareResult(
         scene=context.put_blob(pack_scene(scene)),
-        texel_map=context.put_blob(pack_texel_map(texel_map)),
-        between=tuple(context.put_blob(pack_texel_map(moved)) for moved in between),
-        fine=None if fine is None else context.put_blob(pack_texel_map(fine)),
+        texel_map=context.put_blob(path),
+        between=between,
+        fine=fine,
         scene_hash=digest,
         resolution=lightmap.resolution,
         placements=lightmap.placements[:MOST_PLACEMENTS],
@@ -94,6 +105,25 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
         notes=few_notes((*_coarse_note(texel_map), *scene.notes)),
         seconds=time.perf_counter() - began,
     )
+
+
+def _texel_map_file(scene: Scene, resolution: int, context: Context) -> Path:
+    """A file with the scene's texel map."""
+    path, maker = context.scratch / f"texels-{resolution}", TexelMaker(scene, resolution)
+    write_texel_map(path, maker.shape, (maker.pushed(rows) for rows in bands(maker.shape)))
+    return path
+
+
+def _put_between(scene: Scene, texel_map: TexelMap, context: Context) -> tuple[str, ...]:
+    """The texel maps of the points between, as blobs."""
+    shape = (texel_map.state.shape[0], texel_map.state.shape[1])
+    digests = []
+    for number, way in enumerate(BETWEEN_STEPS):
+        path = context.scratch / f"between-{number}"
+        write_texel_map(path, shape, between_bands(scene, texel_map, way))
+        digests.append(context.put_blob(path))
+        path.unlink()
+    return tuple(digests)
 
 
 def traces_between(settings: BakeSettings) -> bool:

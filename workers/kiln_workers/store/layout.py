@@ -29,6 +29,9 @@ TEXEL_MAP_ARRAYS: Final[Mapping[str, tuple[str, int]]] = {
 }
 """Per-texel arrays kept with the light fields: data type and channels."""
 
+TEXEL_MAP_ROWS: Final = 512
+"""Rows and columns of a chunk of these."""
+
 CONVENTIONS: Final[Mapping[str, str]] = {
     "units": "Positions in metres; radiance in scene units (linear Rec.709 RGB); irradiance in radiance times sr.",
     "world": "Right-handed, +Y up (glTF 2.0).",
@@ -147,7 +150,7 @@ def texel_map_metadata(name: str, shape: tuple[int, int]) -> dict[str, Any]:
     """Array metadata of one of TEXEL_MAP_ARRAYS."""
     data_type, channels = TEXEL_MAP_ARRAYS[name]
     tail, names = ([channels], ["xyz"]) if channels > 1 else ([], [])
-    chunk = [min(shape[0], 512), min(shape[1], 512), *tail]
+    chunk = [min(shape[0], TEXEL_MAP_ROWS), min(shape[1], TEXEL_MAP_ROWS), *tail]
     return _metadata(data_type, [*shape, *tail], chunk, [_BYTES, _ZSTD, _CRC], ["row", "column", *names])
 
 

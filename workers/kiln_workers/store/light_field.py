@@ -10,6 +10,7 @@ Which tiles a bake must have is the database's business, not the store's.
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Final, Self
 
 import numpy as np
@@ -20,6 +21,7 @@ from kiln_schemas import conventions
 from kiln_schemas.errors import Conflict, InputError, InternalError, NotFound, StoreLost, TilesLost
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
+from kiln_workers.scene.bands import release
 from kiln_workers.store import layout
 from kiln_workers.store.location import (
     first_words,
@@ -131,8 +133,13 @@ class LightFieldStore:
         if set(arrays) != set(layout.TEXEL_MAP_ARRAYS):
             raise InternalError(f"texel map arrays are {sorted(layout.TEXEL_MAP_ARRAYS)}, not {sorted(arrays)}")
         for name, values in arrays.items():
-            self._refuse_not_finite(values, name)
-            self._write_array(name, values.astype(layout.TEXEL_MAP_ARRAYS[name][0]))
+            array, dtype = self._array(name), layout.TEXEL_MAP_ARRAYS[name][0]
+            for first in range(0, len(values), layout.TEXEL_MAP_ROWS):
+                rows = slice(first, min(first + layout.TEXEL_MAP_ROWS, len(values)))
+                part = values[rows].astype(dtype)
+                self._refuse_not_finite(part, name)
+                write_patiently(self.url, partial(_write, array[rows], part))
+                release(values)
 
     def read_texel_map(self) -> dict[str, npt.NDArray[Any]]:
         """The arrays of `write_texel_map`; StoreLost where a part of them is not there, or its bytes are damaged."""
@@ -269,10 +276,6 @@ class LightFieldStore:
             f"chunks of {name} of {named} {what}", where=self.url, remedy="Render them again.", labels=labels
         )
 
-    def _write_array(self, name: str, values: npt.NDArray[Any]) -> None:
-        array = self._array(name)
-        write_patiently(self.url, lambda: array[...].write(values).result())
-
     def _write_texels(self, name: str, tile: Tile, covered: Index, values: npt.NDArray[Any]) -> None:
         rows, columns = self._positions(tile, covered, self._scale(name))
         array = self._array(name)
@@ -341,6 +344,10 @@ class LightFieldStore:
         if not np.isfinite(values).all():
             bad = int(np.count_nonzero(~np.isfinite(values)))
             raise InternalError(f"{bad} values of {name} are not finite", where=self.url)
+
+
+def _write(array: Any, values: npt.NDArray[Any]) -> None:
+    array.write(values).result()
 
 
 def _kvstore(url: str) -> Any:
