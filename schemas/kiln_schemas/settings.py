@@ -139,7 +139,7 @@ class FitSettings(Contract):
     solver: Solver = Solver.COHERENT
     lobes: int = Field(ge=1, le=64, description="spherical Gaussians per texel")
     steps: int = Field(ge=1, le=1_000_000, description="optimiser steps of the light field's network, used as it is")
-    start_steps: int = Field(default=100, ge=1, le=1_000_000, description="the same where the coherent descent follows")
+    start_steps: int = Field(default=200, ge=1, le=1_000_000, description="the same where the coherent descent follows")
     visibility_steps: int = Field(default=1000, ge=1, le=1_000_000, description="of the visibility's: it is far easier")
     batch: int = Field(default=32, ge=1, le=1024, description="texels per step")
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
