@@ -26,6 +26,9 @@ _WARM: Final = "render"
 FINE_SEQUENCE: Final = 16
 """The finer irradiance's random numbers begin after those of the texels and of all points between."""
 
+FINE_SHARE: Final = 0.1
+"""About what the finer irradiance takes of a tile's time."""
+
 BETWEEN_SHARE: Final = 0.2
 """About what the light fields between texels take of a tile's time: three points a texel, a quarter of the pixels."""
 
@@ -39,20 +42,22 @@ def run(payload: RenderPayload, context: Context) -> RenderResult:
     inside = covered_texels(texel_map, tile)
     place = map_coordinates(tile, inside)
     batch = TexelBatch.of(texel_map, place)
-    share = 1.0 - BETWEEN_SHARE if warm.between else 1.0
+    fine_from = 1.0 - FINE_SHARE if warm.fine is not None else 1.0
+    between_from = fine_from - BETWEEN_SHARE if warm.between else fine_from
 
     def on_progress(fraction: float) -> None:
         context.progress(fraction * len(inside), len(inside), "texels", f"tile {tile.row},{tile.column}")
 
-    images = warm.renderer.render(batch, lambda done: on_progress(share * done))
+    images = warm.renderer.render(batch, lambda done: on_progress(between_from * done))
     warm.store.write_tile(tile, inside, images.light_field, images.visibility, images.irradiance)
     paths = images.paths
     if warm.between:
-        between, more = _trace_between(warm, payload, place, lambda done: on_progress(share + (1.0 - share) * done))
+        span = fine_from - between_from
+        between, more = _trace_between(warm, payload, place, lambda done: on_progress(between_from + span * done))
         warm.store.write_between(tile, inside, between)
         paths += more
     if warm.fine is not None:
-        paths += _render_fine(warm, warm.fine, payload)
+        paths += _render_fine(warm, warm.fine, payload, lambda done: on_progress(fine_from + FINE_SHARE * done))
     warm.store.check()
     invalid = inside[images.enclosed]
     return RenderResult(
@@ -65,11 +70,11 @@ def run(payload: RenderPayload, context: Context) -> RenderResult:
     )
 
 
-def _render_fine(warm: "_Warm", fine: TexelMap, payload: RenderPayload) -> int:
+def _render_fine(warm: "_Warm", fine: TexelMap, payload: RenderPayload, on_progress: Callable[[float], None]) -> int:
     """Write the tile's part of the finer irradiance map; how many paths it took."""
     inside, place = covered_finer(fine, payload.tile, warm.store.irradiance_scale)
     batch = TexelBatch.of(fine, place, FINE_SEQUENCE * warm.texel_map.state.size)
-    irradiance, paths, _ = warm.renderer.render_fine_irradiance(batch)
+    irradiance, paths, _ = warm.renderer.render_fine_irradiance(batch, on_progress)
     warm.store.write_fine_irradiance(payload.tile, inside, irradiance)
     return paths
 
