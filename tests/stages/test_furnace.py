@@ -65,7 +65,7 @@ def test_inside_a_glowing_box_everything_is_constant(furnace: Path) -> None:
     irradiance = store.read_irradiance(tiles)[valid]
     np.testing.assert_allclose(irradiance, np.pi * GLOW, rtol=0.01)
     package = read(furnace / "package")
-    np.testing.assert_allclose(package.irradiance.numpy()[valid], np.pi * GLOW, rtol=0.01)
+    np.testing.assert_allclose(package.irradiance.numpy(), np.pi * GLOW, rtol=0.01)  # gutters are filled
     directions = octahedral.pixel_directions(store.image_size).reshape(-1, 3)
     weight = octahedral.pixel_solid_angles(store.image_size).ravel()
     lobes = package.lobes.light_field.numpy().astype(np.float64)
