@@ -104,7 +104,9 @@ def _prepared_blobs(job: JobRow) -> dict[str, Any]:
     """The blobs that the prepare task made, by the names that payloads have for them."""
     assert job.prepared is not None, "tasks after the prepare task wait for it"
     made = job.prepared
-    return {name: made[name] for name in ("scene", "texel_map")} | {
+    return {
+        "scene": made["scene"],
+        "texel_map": made["texel_map"],
         "between": made.get("between", ()),
         "fine": made.get("fine"),
     }

@@ -124,3 +124,23 @@ def two_quads() -> Scene:
         ),
         (Material("plain"),),
     )
+
+
+@pytest.fixture
+def surface():
+    """What the light sees of each mesh of a scene: name, and corner by corner all that belongs to it."""
+
+    def of(scene):
+        out = {}
+        for mesh in scene.meshes:
+            corner = mesh.faces.reshape(-1)
+            out[mesh.name] = {
+                "positions": (mesh.positions.astype(np.float64) + scene.origin)[corner],
+                "normals": mesh.normals[corner],
+                "lightmap_uv": mesh.lightmap_uv[corner],
+                "colors": mesh.colors[corner],
+                "uv": mesh.uv[corner],
+            }
+        return out
+
+    return of

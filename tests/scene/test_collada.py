@@ -97,23 +97,8 @@ def load(folder, text: str):
     return load_scene(folder, "a.dae")
 
 
-def surface(scene):
-    """What the light sees of each mesh: name, and corner by corner all that belongs to it."""
-    out = {}
-    for mesh in scene.meshes:
-        corner = mesh.faces.reshape(-1)
-        out[mesh.name] = {
-            "positions": (mesh.positions.astype(np.float64) + scene.origin)[corner],
-            "normals": mesh.normals[corner],
-            "lightmap_uv": mesh.lightmap_uv[corner],
-            "colors": mesh.colors[corner],
-            "uv": mesh.uv[corner],
-        }
-    return out
-
-
 @pytest.mark.parametrize(("up", "unit"), WORLD)
-def test_a_collada_scene_is_its_gltf_twin(tmp_path, gltf, write_image, up, unit):
+def test_a_collada_scene_is_its_gltf_twin(tmp_path, gltf, write_image, surface, up, unit):
     """Nodes, mirrors, instances, two UV sets, colours, a texture and lights, under each up axis and some unit."""
     write_image(tmp_path / "a.png", np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
     one = material("paint", f"<lambert><diffuse>{TEXTURE}</diffuse></lambert>", SAMPLER)

@@ -134,23 +134,8 @@ def one_quad(paint: str, *more: str, links=()) -> str:
     return document(objects, [(200, 0), (GEOMETRY, 200), (MATERIAL, 200), *links])
 
 
-def surface(scene):
-    """What the light sees of each mesh, corner by corner."""
-    out = {}
-    for each in scene.meshes:
-        corner = each.faces.reshape(-1)
-        out[each.name] = {
-            "positions": (each.positions.astype(np.float64) + scene.origin)[corner],
-            "normals": each.normals[corner],
-            "lightmap_uv": each.lightmap_uv[corner],
-            "colors": each.colors[corner],
-            "uv": each.uv[corner],
-        }
-    return out
-
-
 @pytest.mark.parametrize("world", WORLD)
-def test_an_fbx_scene_is_its_gltf_twin(tmp_path, gltf, write_image, world):
+def test_an_fbx_scene_is_its_gltf_twin(tmp_path, gltf, write_image, surface, world):
     """Nodes, mirrors, instances, two UV sets, colours, a texture and lights, under each up axis and some unit."""
     write_image(tmp_path / "a.png", np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
     *_, unit, columns = WORLD[world]

@@ -19,7 +19,7 @@ from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
 from kiln_workers.scene.texels import build_texel_map
 from kiln_workers.shade import textures
 from kiln_workers.stages import prepare
-from kiln_workers.stages.tiles import covered_finer, without_texels
+from kiln_workers.stages.tiles import covered_texels, map_coordinates, without_texels
 from kiln_workers.store.light_field import LightFieldStore
 
 SCALE = 4
@@ -53,9 +53,9 @@ def test_every_finer_texel_is_in_one_tile(baked: Baked) -> None:
     finer_map = unpack_texel_map(baked.context.blob(baked.prepared.fine or ""))
     count = np.zeros(finer_map.state.shape, int)
     for tile in baked.prepared.tiles:
-        inside, place = covered_finer(finer_map, tile, SCALE)
+        inside = covered_texels(finer_map, tile, SCALE)
         assert (np.diff(inside) > 0).all() and (inside < (SCALE * tile.size) ** 2).all()
-        count[place] += 1
+        count[map_coordinates(tile, inside, SCALE)] += 1
     np.testing.assert_array_equal(count, finer_map.state != TexelState.GUTTER)
 
 

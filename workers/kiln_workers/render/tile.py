@@ -148,10 +148,7 @@ class TileRenderer:
             paths += int(np.array(sums.paths).sum())
             overflows += clamped + int(np.array(sums.dropped).sum())
             on_progress(fraction)
-        enclosed = np.zeros(len(texels), bool)
-        if offsets is None:
-            dark = np.flatnonzero(~out.any(axis=(1, 2)))
-            enclosed[dark] = enclosure.enclosed(self.tracer, _origins(texels)[dark], texels.normal[dark])
+        enclosed = self._enclosed(texels, out) if offsets is None else np.zeros(len(texels), bool)
         return TileImages(
             light_field=out.reshape(len(texels), size, size, 3),
             visibility=None,
@@ -201,10 +198,15 @@ class TileRenderer:
     def render_fine_irradiance(self, texels: TexelBatch, on_progress: Progress = silent) -> tuple[Float32, int, int]:
         """The same of a finer map's texels: -1 where no light reaches a point and it lies inside something."""
         irradiance, paths, dropped = self.render_irradiance(texels, on_progress)
-        dark = np.flatnonzero(~irradiance.any(axis=1))
-        inside = enclosure.enclosed(self.tracer, _origins(texels)[dark], texels.normal[dark])
-        irradiance[dark[inside]] = INSIDE_GEOMETRY
+        irradiance[self._enclosed(texels, irradiance)] = INSIDE_GEOMETRY
         return irradiance, paths, dropped
+
+    def _enclosed(self, texels: TexelBatch, light: Float16 | Float32) -> npt.NDArray[np.bool_]:
+        """Which texels [T] lie inside something, of those that have no light [T, ...]; the others are not asked."""
+        out = np.zeros(len(texels), bool)
+        dark = np.flatnonzero(~light.any(axis=tuple(range(1, light.ndim))))
+        out[dark] = enclosure.enclosed(self.tracer, _origins(texels)[dark], texels.normal[dark])
+        return out
 
     def _trace_irradiance(self, texels: TexelBatch, texel: Int64, block: Int64, counts: Int64) -> tuple[LaneSums, Any]:
         """One wavefront of blocks of irradiance samples: cosine-distributed paths, and next-event estimates."""

@@ -6,7 +6,7 @@ the surfaces, `collada_lights` the lights, `collada_skins` the skins. docs/scene
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -20,10 +20,10 @@ from kiln_workers.scene.collada_lights import read_light
 from kiln_workers.scene.collada_materials import Materials, is_double_sided
 from kiln_workers.scene.collada_nodes import Placed, placed_nodes
 from kiln_workers.scene.collada_skins import Joints, Skin, read_skin
-from kiln_workers.scene.geometry import Floats, RawMesh, check_mesh_count, check_triangle_count, place, unique_names
+from kiln_workers.scene.geometry import Floats, RawMesh, check_mesh_count, check_triangle_count, placed_meshes
 from kiln_workers.scene.gltf_deform import skinned
 from kiln_workers.scene.limits import MAX_TEXT_BYTES, NAME_LENGTH
-from kiln_workers.scene.model import Mesh, PunctualLight, Scene
+from kiln_workers.scene.model import PunctualLight, Scene
 from kiln_workers.scene.texture_files import Coat, TextureFiles
 from kiln_workers.scene.xml_nodes import Node
 
@@ -59,19 +59,14 @@ class _Reader:
         files = TextureFiles(self.bundle, document.notes)
         materials = Materials(document, files)
         placed = placed_nodes(document)
-        pairs = list(self._instances(placed, materials))
-        names = unique_names(raw.name for raw, _ in pairs)
-        meshes: list[Mesh] = []
-        for name, (raw, matrix) in zip(names, pairs, strict=True):
-            mesh, notes = place(replace(raw, name=name), matrix)
-            document.notes += notes
-            meshes += [mesh] if mesh is not None else []
+        meshes, notes = placed_meshes(self._instances(placed, materials))
+        document.notes += notes
         lights = tuple(self._lights(placed))
         if document.root.child("library_animations", "animation") is not None:
             document.notes.append(f"'{document.where}': animations ignored; the scene is baked in its rest pose.")
         ignored = [f"'{document.where}': {what} ({count}) ignored." for what, count in sorted(document.ignored.items())]
         notes_in_order = tuple(dict.fromkeys([*document.notes, *ignored]))
-        return Scene(tuple(meshes), tuple(materials.materials), tuple(files.images), lights, notes=notes_in_order)
+        return Scene(meshes, tuple(materials.materials), tuple(files.images), lights, notes=notes_in_order)
 
     def _lights(self, placed: list[Placed]) -> Iterator[PunctualLight]:
         for item in placed:

@@ -27,14 +27,13 @@ from kiln_workers.scene.geometry import (
     RawMesh,
     check_mesh_count,
     check_triangle_count,
-    place,
-    unique_names,
+    placed_meshes,
     unit,
 )
 from kiln_workers.scene.gltf_deform import skinned
 from kiln_workers.scene.images import linearised
 from kiln_workers.scene.limits import NAME_LENGTH, check_count
-from kiln_workers.scene.model import LightKind, Mesh, PunctualLight, Scene
+from kiln_workers.scene.model import LightKind, PunctualLight, Scene
 from kiln_workers.scene.polygons import triangulated
 from kiln_workers.scene.texture_files import TextureFiles
 
@@ -98,13 +97,8 @@ class _Reader:
         files = TextureFiles(self.bundle, self.notes)
         materials = FbxMaterials(self.body, self.arrays, files)
         hidden = self._hidden()
-        pairs = list(self._instances(materials, hidden))
-        names = unique_names(raw.name for raw, _ in pairs)
-        meshes: list[Mesh] = []
-        for name, (raw, matrix) in zip(names, pairs, strict=True):
-            mesh, notes = place(replace(raw, name=name), matrix)
-            self.notes += notes
-            meshes += [mesh] if mesh is not None else []
+        meshes, notes = placed_meshes(self._instances(materials, hidden))
+        self.notes += notes
         lights = tuple(self._lights(hidden))
         entry = self.bundle.origin
         for what in ("curves", "nurbs"):
@@ -113,7 +107,7 @@ class _Reader:
         if self.body["animated"]:
             self.notes.append(f"'{entry}': animations ignored; the scene is baked in its rest pose.")
         images, notes_in_order = tuple(files.images), tuple(dict.fromkeys(self.notes))
-        return Scene(tuple(meshes), tuple(materials.materials), images, lights, notes=notes_in_order)
+        return Scene(meshes, tuple(materials.materials), images, lights, notes=notes_in_order)
 
     def _hidden(self) -> set[int]:
         """Nodes that are not seen: hidden ones, further levels of detail, and all below them."""

@@ -7,7 +7,7 @@ degenerate faces are dropped with a note.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +38,18 @@ class RawMesh:
     more_uv: tuple[Floats, ...] = ()  # [V, 2] each
     colors: Floats | None = None  # [V, 4] linear RGBA
     tangents: Floats | None = None  # [V, 4] as glTF's TANGENT
+
+
+def placed_meshes(instances: Iterable[tuple[RawMesh, Floats]]) -> tuple[tuple[Mesh, ...], list[str]]:
+    """The meshes of a scene's instances, each with its transform (`place`), under names of their own; and notes."""
+    pairs = list(instances)
+    meshes: list[Mesh] = []
+    notes: list[str] = []
+    for name, (raw, transform) in zip(unique_names(raw.name for raw, _ in pairs), pairs, strict=True):
+        mesh, more = place(replace(raw, name=name), transform)
+        notes += more
+        meshes += [mesh] if mesh is not None else []
+    return tuple(meshes), notes
 
 
 def place(raw: RawMesh, transform: Floats | None = None) -> tuple[Mesh | None, list[str]]:

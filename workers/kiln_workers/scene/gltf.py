@@ -21,8 +21,7 @@ from kiln_workers.scene.geometry import (
     RawMesh,
     check_mesh_count,
     check_triangle_count,
-    place,
-    unique_names,
+    placed_meshes,
 )
 from kiln_workers.scene.gltf_buffers import GltfBuffers, split_glb
 from kiln_workers.scene.gltf_compression import decode_draco
@@ -42,7 +41,7 @@ from kiln_workers.scene.gltf_document import (
 )
 from kiln_workers.scene.gltf_extensions import check_extensions
 from kiln_workers.scene.gltf_materials import MaterialTable
-from kiln_workers.scene.model import LightKind, Mesh, PunctualLight, Scene
+from kiln_workers.scene.model import LightKind, PunctualLight, Scene
 from kiln_workers.scene.polygons import FAN, STRIP, TRIANGLES, listed_faces
 
 
@@ -127,18 +126,15 @@ class _Reader:
         materials = MaterialTable(self.document, self.buffers, self.notes)
         placed = placed_nodes(document, self.entry)
         hidden = sum(not item.visible for item in placed)
-        meshes: list[Mesh] = []
-        for raw, matrix in self._instances(placed, materials):
-            mesh, notes = place(raw, matrix)
-            self.notes += notes
-            meshes += [mesh] if mesh is not None else []
+        meshes, notes = placed_meshes(self._instances(placed, materials))
+        self.notes += notes
         self.notes += [f"'{self.entry}': {what} ({count}) ignored." for what, count in sorted(self.ignored.items())]
         if self.document.animations:
             self.notes.append(f"'{self.entry}': animations ignored; the scene is baked in its rest pose.")
         if hidden:
             self.notes.append(f"'{self.entry}': {hidden} hidden nodes left out.")
         return Scene(
-            meshes=tuple(meshes),
+            meshes=meshes,
             materials=tuple(materials.materials),
             images=tuple(materials.images),
             lights=tuple(self._lights(placed)),
@@ -173,8 +169,7 @@ class _Reader:
                     pairs.append((skinned(raw, part.influence, joints), np.eye(4)))
                 else:
                     pairs += [(raw, matrix) for matrix in matrices]
-        names = unique_names(raw.name for raw, _ in pairs)
-        return [(replace(raw, name=name), matrix) for name, (raw, matrix) in zip(names, pairs, strict=True)]
+        return pairs
 
     def _instance_matrices(self, item: Placed, before: int) -> list[Floats]:
         """World transforms of a node's instances; `before` are there already."""

@@ -15,7 +15,7 @@ from kiln_workers.render.tile import TexelBatch, TileRenderer
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import unpack_scene
 from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
-from kiln_workers.stages.tiles import covered_finer, covered_texels, map_coordinates
+from kiln_workers.stages.tiles import covered_texels, map_coordinates
 from kiln_workers.store.light_field import LightFieldStore
 
 Float16 = npt.NDArray[np.float16]
@@ -72,8 +72,9 @@ def run(payload: RenderPayload, context: Context) -> RenderResult:
 
 def _render_fine(warm: "_Warm", fine: TexelMap, payload: RenderPayload, on_progress: Callable[[float], None]) -> int:
     """Write the tile's part of the finer irradiance map; how many paths it took."""
-    inside, place = covered_finer(fine, payload.tile, warm.store.irradiance_scale)
-    batch = TexelBatch.of(fine, place, FINE_SEQUENCE * warm.texel_map.state.size)
+    scale = warm.store.irradiance_scale
+    inside = covered_texels(fine, payload.tile, scale)
+    batch = TexelBatch.of(fine, map_coordinates(payload.tile, inside, scale), FINE_SEQUENCE * warm.texel_map.state.size)
     irradiance, paths, _ = warm.renderer.render_fine_irradiance(batch, on_progress)
     warm.store.write_fine_irradiance(payload.tile, inside, irradiance)
     return paths

@@ -24,28 +24,20 @@ def plan_tiles(texel_map: TexelMap, size: int) -> tuple[Tile, ...]:
     return tuple(tiles)
 
 
-def covered_texels(texel_map: TexelMap, tile: Tile) -> Ints:
-    """Row-major indices inside the tile [T] of its texels with a surface point, ascending."""
-    part = texel_map.state[tile.row : tile.row + tile.size, tile.column : tile.column + tile.size]
-    rows, columns = np.nonzero(part != TexelState.GUTTER)
-    return np.asarray(rows * tile.size + columns, dtype=np.int64)
+def covered_texels(texel_map: TexelMap, tile: Tile, scale: int = 1) -> Ints:
+    """Row-major indices inside the tile [T] of its texels with a surface point, ascending.
 
-
-def covered_finer(finer: TexelMap, tile: Tile, scale: int) -> tuple[Ints, tuple[Ints, Ints]]:
-    """Texels of a map with `scale` texels along each side of a texel that lie in a tile and have a surface point.
-
-    Row-major indices inside the tile's finer square [T], ascending; rows and columns in the finer map.
+    Tiles are squares of the light map; a finer map has `scale` texels along each side of one of its texels.
     """
     row, column, size = scale * tile.row, scale * tile.column, scale * tile.size
-    part = finer.state[row : row + size, column : column + size]
-    rows, columns = (np.asarray(place, dtype=np.int64) for place in np.nonzero(part != TexelState.GUTTER))
-    return rows * size + columns, (rows + row, columns + column)
+    rows, columns = np.nonzero(texel_map.state[row : row + size, column : column + size] != TexelState.GUTTER)
+    return np.asarray(rows * size + columns, dtype=np.int64)
 
 
-def map_coordinates(tile: Tile, inside: Ints) -> tuple[Ints, Ints]:
-    """Rows and columns in the light map of row-major indices inside a tile."""
-    rows, columns = np.divmod(inside, tile.size)
-    return rows + tile.row, columns + tile.column
+def map_coordinates(tile: Tile, inside: Ints, scale: int = 1) -> tuple[Ints, Ints]:
+    """Rows and columns in the light map, or in a finer one, of row-major indices inside a tile."""
+    rows, columns = np.divmod(inside, scale * tile.size)
+    return rows + scale * tile.row, columns + scale * tile.column
 
 
 def with_render_verdict(texel_map: TexelMap, renders: Iterable[RenderResult]) -> TexelMap:
