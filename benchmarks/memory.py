@@ -281,7 +281,11 @@ def run(folder: Path, size: int, arguments: argparse.Namespace) -> list[dict[str
         "environment": str(arguments.environment) if arguments.environment else "",
         "visibility": arguments.visibility or size <= 256,
         "settings": [
-            *(f"lightmap.resolution={size}", f"lightmap.tile={64 if size > 512 else 16}"),
+            *(
+                "lightmap.irradiance_scale=1",
+                f"lightmap.resolution={size}",
+                f"lightmap.tile={64 if size > 512 else 16}",
+            ),
             *(f"render.image_size={IMAGE_SIZE}", "render.samples=1", "fit.block=64", f"fit.lobes={arguments.lobes}"),
             *arguments.set,
         ],

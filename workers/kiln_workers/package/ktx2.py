@@ -5,13 +5,15 @@ data format descriptor. Texel data lie [layer, face, row, column, channel] insid
 first in the file. `kiln_workers.package.ktx2_validate` checks files from the specification without this module.
 """
 
+import mmap
 import os
 import struct
-from collections.abc import Mapping, Sequence
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +22,8 @@ import zstandard
 from kiln_schemas import __version__
 from kiln_schemas.errors import InputError, InternalError, TooLarge
 from kiln_schemas.files import open_regular
-from kiln_workers.package.files import write_bytes
-from kiln_workers.package.ktx2_validate import validate
+from kiln_workers.package.files import whole_file, write_bytes
+from kiln_workers.package.ktx2_validate import WINDOW_BYTES, FileBytes, validate
 
 Half = npt.NDArray[np.float16]
 
@@ -31,6 +33,9 @@ TEXEL_BYTES: Final = 8
 SCHEME_NONE: Final = 0
 SCHEME_ZSTD: Final = 2
 ZSTD_LEVEL: Final = 9
+ONE_PIECE_BYTES: Final = 1 << 27
+"""A level up to this is compressed in one piece, which takes as much memory again; a larger one as a stream."""
+STREAM_BYTES: Final = 1 << 22
 
 OVERHEAD_BYTES: Final = 2**16
 """What a file has besides its texels, at most."""
@@ -51,6 +56,10 @@ class Texture:
     metadata: Mapping[str, str]
 
     @property
+    def shape(self) -> "Shape":
+        return Shape(self.width, self.height, self.layers, self.faces, self.is_array, self.metadata)
+
+    @property
     def layers(self) -> int:
         return int(self.levels[0].shape[0])
 
@@ -65,6 +74,27 @@ class Texture:
     @property
     def width(self) -> int:
         return int(self.levels[0].shape[3])
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a file's header says of its texture."""
+
+    width: int
+    height: int
+    layers: int
+    faces: int
+    is_array: bool
+    metadata: Mapping[str, str]
+
+    @property
+    def nbytes(self) -> int:
+        """Of the texels of the largest level."""
+        return TEXEL_BYTES * self.width * self.height * self.layers * self.faces
+
+
+Bands = Iterable[tuple[int, Half]]
+"""First row and texels [layers, B, width, 4] of each band of rows, top to bottom."""
 
 
 def texture_2d(pixels: Half, metadata: Mapping[str, str]) -> Texture:
@@ -87,34 +117,39 @@ def encode(texture: Texture, *, supercompress: bool = False) -> bytes:
     _check(texture)
     plain = [np.ascontiguousarray(level, dtype="<f2").tobytes() for level in texture.levels]
     stored = [zstandard.compress(data, ZSTD_LEVEL) for data in plain] if supercompress else plain
-    descriptor = _data_format_descriptor()
-    pairs = _key_value_data({**texture.metadata, "KTXorientation": "rd", "KTXwriter": f"lightkiln {__version__}"})
+    lengths = [(len(data), len(bare)) for data, bare in zip(stored, plain, strict=True)]
+    out, offsets = _head(texture.shape, lengths, supercompress)
+    for level in reversed(range(len(stored))):
+        out += bytes(offsets[level] - len(out)) + stored[level]
+    return bytes(out)
 
-    descriptor_at = _HEADER.size + _INDEX.size + _LEVEL.size * len(stored)
+
+def _head(shape: Shape, lengths: Sequence[tuple[int, int]], supercompressed: bool) -> tuple[bytearray, list[int]]:
+    """All that comes before the levels, and where each begins, from the lengths of their stored and plain bytes."""
+    descriptor = _data_format_descriptor()
+    pairs = _key_value_data({**shape.metadata, "KTXorientation": "rd", "KTXwriter": f"lightkiln {__version__}"})
+    descriptor_at = _HEADER.size + _INDEX.size + _LEVEL.size * len(lengths)
     pairs_at = descriptor_at + len(descriptor)
     end = pairs_at + len(pairs)
-    body: list[bytes] = []
-    entries: list[bytes] = [b""] * len(stored)
-    for level in reversed(range(len(stored))):
-        padding = 0 if supercompress else -end % TEXEL_BYTES
-        entries[level] = _LEVEL.pack(end + padding, len(stored[level]), len(plain[level]))
-        body += [bytes(padding), stored[level]]
-        end += padding + len(stored[level])
-
+    offsets = [0] * len(lengths)
+    for level in reversed(range(len(lengths))):
+        offsets[level] = end if supercompressed else end + -end % TEXEL_BYTES
+        end = offsets[level] + lengths[level][0]
     header = _HEADER.pack(
         IDENTIFIER,
         VK_FORMAT_R16G16B16A16_SFLOAT,
         2,  # typeSize: bytes of the type to swap on big-endian machines
-        texture.width,
-        texture.height,
+        shape.width,
+        shape.height,
         0,  # pixelDepth: not a volume
-        texture.layers if texture.is_array else 0,
-        texture.faces,
-        len(stored),
-        SCHEME_ZSTD if supercompress else SCHEME_NONE,
+        shape.layers if shape.is_array else 0,
+        shape.faces,
+        len(lengths),
+        SCHEME_ZSTD if supercompressed else SCHEME_NONE,
     )
     index = _INDEX.pack(descriptor_at, len(descriptor), pairs_at, len(pairs), 0, 0)
-    return b"".join([header, index, *entries, descriptor, pairs, *body])
+    entries = [_LEVEL.pack(offset, *length) for offset, length in zip(offsets, lengths, strict=True)]
+    return bytearray(b"".join([header, index, *entries, descriptor, pairs])), offsets
 
 
 def write(path: Path, texture: Texture, *, supercompress: bool = False) -> None:
@@ -124,6 +159,59 @@ def write(path: Path, texture: Texture, *, supercompress: bool = False) -> None:
     if faults:
         raise InternalError(f"the KTX2 writer made an invalid file: {faults[0]}", where=path.name)
     write_bytes(path, data)
+
+
+def write_bands(path: Path, shape: Shape, bands: Bands, *, supercompress: bool = False) -> None:
+    """Write a texture of one level and one face that is never in memory as a whole, validated and atomically.
+
+    The bytes are those of `write`, but for a compressed level of more than ONE_PIECE_BYTES, in which a stream of
+    Zstandard ends its blocks elsewhere.
+    """
+    with whole_file(path) as file:
+        if supercompress:
+            with tempfile.TemporaryFile(dir=path.parent) as plain:
+                _write_level(plain, 0, shape, bands)
+                _compress_level(file, plain, shape)
+        else:
+            head, offsets = _head(shape, [(shape.nbytes, shape.nbytes)], False)
+            file.write(head)
+            _write_level(file, offsets[0], shape, bands)
+        faults = validate(FileBytes(file))
+        if faults:
+            raise InternalError(f"the KTX2 writer made an invalid file: {faults[0]}", where=path.name)
+
+
+def _write_level(file: BinaryIO, start: int, shape: Shape, bands: Bands) -> None:
+    """Write a level's bands where they belong, [layer, row, column, channel], from byte `start` on."""
+    done = 0
+    for first, texels in bands:
+        expected = (shape.layers, texels.shape[1], shape.width, 4)
+        if texels.shape != expected or texels.dtype != np.float16 or first != done:
+            raise InternalError(f"rows from {first} are {texels.dtype} {texels.shape}, not float16 {expected}")
+        if not np.isfinite(texels).all():
+            raise InternalError(f"rows from {first} hold values that are not finite", where="KTX2")
+        for layer, rows in enumerate(texels):
+            file.seek(start + TEXEL_BYTES * shape.width * (layer * shape.height + first))
+            file.write(np.ascontiguousarray(rows, "<f2").data)
+        done += texels.shape[1]
+    if done != shape.height:
+        raise InternalError(f"the bands have {done} rows, the texture {shape.height}", where="KTX2")
+
+
+def _compress_level(file: BinaryIO, plain: BinaryIO, shape: Shape) -> None:
+    """Write the whole file of a texture whose only level is the content of `plain`."""
+    _, offsets = _head(shape, [(0, shape.nbytes)], True)
+    file.seek(offsets[0])
+    plain.seek(0)
+    compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
+    if shape.nbytes <= ONE_PIECE_BYTES:
+        length = file.write(compressor.compress(plain.read()))
+    else:
+        _, length = compressor.copy_stream(
+            plain, file, size=shape.nbytes, read_size=STREAM_BYTES, write_size=STREAM_BYTES
+        )
+    file.seek(0)
+    file.write(_head(shape, [(length, shape.nbytes)], True)[0])
 
 
 def decode(data: bytes, *, where: str = "KTX2") -> Texture:
@@ -159,6 +247,40 @@ def read(path: Path, most_bytes: int | None = None) -> Texture:
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=path.name) from None
     return decode(data, where=path.name)
+
+
+def map_layers(path: Path, most_bytes: int) -> tuple[npt.NDArray[np.float16], Shape]:
+    """The texels [layers, height * width, 4] of a texture of one level and one face, mapped from their file.
+
+    A compressed level is inflated into a file without a name beside it. Errors as of `read`.
+    """
+    try:
+        with open_regular(path) as file:
+            _refuse_larger(file, path.name, most_bytes)
+            faults = validate(FileBytes(file))
+            head = FileBytes(file)[: _HEADER.size + _INDEX.size + _LEVEL.size]
+            if not faults and _HEADER.unpack_from(head)[7:9] != (1, 1):
+                faults = ["it has more than one face or level"]
+            if faults:
+                raise InputError(faults[0], where=path.name, remedy="Bake or download the package again.")
+            _, _, _, width, height, _, layers, faces, _, scheme = _HEADER.unpack_from(head)
+            offset, _, _ = _LEVEL.unpack_from(head, _HEADER.size + _INDEX.size)
+            shape = Shape(width, height, max(1, layers), faces, layers > 0, {})
+            if scheme != SCHEME_ZSTD:
+                return _mapped_level(file, offset, shape), shape
+            with tempfile.TemporaryFile(dir=path.parent) as plain:
+                file.seek(offset)
+                zstandard.ZstdDecompressor(max_window_size=WINDOW_BYTES).copy_stream(file, plain)
+                plain.flush()
+                return _mapped_level(plain, 0, shape), shape
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=path.name) from None
+
+
+def _mapped_level(file: BinaryIO, offset: int, shape: Shape) -> npt.NDArray[np.float16]:
+    pages = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    texels = np.frombuffer(pages, "<f2", shape.nbytes // 2, offset)
+    return texels.reshape(shape.layers, shape.height * shape.width, 4)
 
 
 def _refuse_larger(file: BufferedReader, name: str, most_bytes: int) -> None:

@@ -5,10 +5,11 @@ revisions, so rules are named) and returns every breach as a sentence. It accept
 refuses the rest: RGBA16F texels in 2D textures, 2D arrays and cube maps, plain or with Zstandard.
 """
 
+import os
 import re
 import struct
 from dataclasses import dataclass, field
-from typing import Final
+from typing import BinaryIO, Final
 
 import zstandard
 
@@ -47,11 +48,27 @@ _RESERVED_KEYS: Final = {
 }
 
 
+class FileBytes:
+    """A file's bytes, of which only those are read that are asked for."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._length = file.seek(0, os.SEEK_END)
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, part: slice) -> bytes:
+        first, last, _ = part.indices(self._length)
+        self._file.seek(first)
+        return self._file.read(max(last - first, 0))
+
+
 @dataclass
 class _File:
     """The bytes under inspection, the header's fields by name, and the faults found so far."""
 
-    data: bytes
+    data: bytes | FileBytes
     head: dict[str, int]
     faults: list[str] = field(default_factory=list)
 
@@ -60,17 +77,20 @@ class _File:
             self.faults.append(sentence)
         return holds
 
+    def unpack(self, layout: str, offset: int) -> tuple[int, ...]:
+        return struct.unpack(layout, self.data[offset : offset + struct.calcsize(layout)])
+
     def inside(self, offset: int, length: int) -> bool:
         return offset >= 0 and offset + length <= len(self.data)
 
 
-def validate(data: bytes) -> list[str]:
+def validate(data: bytes | FileBytes) -> list[str]:
     """Every breach of the specification in a KTX 2.0 file's bytes, as sentences; empty for a valid file."""
     if data[:12] != bytes((0xAB, 0x4B, 0x54, 0x58, 0x20, 0x32, 0x30, 0xBB, 0x0D, 0x0A, 0x1A, 0x0A)):
         return ["the first 12 bytes are not the KTX 2.0 identifier"]
     if len(data) < _FIRST_LEVEL_AT:
         return [f"the file ends inside the header, after {len(data)} bytes"]
-    file = _File(data, dict(zip(_HEADER_FIELDS, struct.unpack_from("<13I2Q", data, 12), strict=True)))
+    file = _File(data, dict(zip(_HEADER_FIELDS, struct.unpack("<13I2Q", data[12:_FIRST_LEVEL_AT]), strict=True)))
     _check_header(file)
     if file.faults:
         return file.faults
@@ -132,7 +152,7 @@ def _check_descriptor(file: _File) -> None:
     start, length = file.head["dfdByteOffset"], file.head["dfdByteLength"]
     if not file.require(length == 92, f"dfdByteLength is {length}; one block with four samples takes 92"):
         return
-    words = struct.unpack_from("<23I", file.data, start)
+    words = file.unpack("<23I", start)
     vendor_and_type, version, block_size = words[1], words[2] & 0xFFFF, words[2] >> 16
     file.require(words[0] == length, f"dfdTotalSize is {words[0]}, dfdByteLength {length}")
     file.require(vendor_and_type == 0, "the descriptor block is not Khronos' basic one")
@@ -163,7 +183,7 @@ def _check_key_values(file: _File) -> None:
     while at < end:
         if not file.require(end - at >= 4, "the key/value data end inside a length"):
             return
-        (length,) = struct.unpack_from("<I", file.data, at)
+        (length,) = file.unpack("<I", at)
         pair = file.data[at + 4 : at + 4 + length]
         if not file.require(2 <= length <= end - at - 4, f"a key/value pair has length {length}"):
             return
@@ -196,7 +216,7 @@ def _check_levels(file: _File) -> None:
     compressed = head["supercompressionScheme"] == 2
     at = head["kvdByteOffset"] + head["kvdByteLength"] or head["dfdByteOffset"] + head["dfdByteLength"]
     for level in reversed(range(head["levelCount"])):
-        offset, length, plain = struct.unpack_from("<3Q", file.data, _FIRST_LEVEL_AT + 24 * level)
+        offset, length, plain = file.unpack("<3Q", _FIRST_LEVEL_AT + 24 * level)
         width, height = max(1, head["pixelWidth"] >> level), max(1, head["pixelHeight"] >> level)
         wanted = 8 * width * height * head["faceCount"] * max(1, head["layerCount"])
         name = f"level {level}"
@@ -207,26 +227,26 @@ def _check_levels(file: _File) -> None:
             return
         file.require(not any(file.data[at:offset]), f"{name}: mipPadding is not 0")
         if compressed:
-            _check_frame(file, name, file.data[offset : offset + length], plain)
+            _check_frame(file, name, offset, length, plain)
         else:
             file.require(length == plain, f"{name}: byteLength is {length}, uncompressedByteLength {plain}")
         at = offset + length
     file.require(at == len(file.data), f"{len(file.data) - at} bytes follow the last level")
 
 
-def _check_frame(file: _File, name: str, data: bytes, plain: int) -> None:
+def _check_frame(file: _File, name: str, offset: int, length: int, plain: int) -> None:
     """A supercompressed level must be one Zstandard frame that inflates to the stated length."""
     inflater = zstandard.ZstdDecompressor(max_window_size=WINDOW_BYTES).decompressobj()
-    found = end = 0
+    found, at, end = 0, offset, offset + length
     try:
-        while end < len(data) and not inflater.eof and found <= plain:
-            found += len(inflater.decompress(data[end : end + PIECE_BYTES]))
-            end += PIECE_BYTES
+        while at < end and not inflater.eof and found <= plain:
+            found += len(inflater.decompress(file.data[at : min(at + PIECE_BYTES, end)]))
+            at += PIECE_BYTES
     except zstandard.ZstdError as error:
         file.require(False, f"{name}: not a Zstandard frame ({error})")
         return
     if not file.require(found <= plain, f"{name}: inflates to more than its uncompressedByteLength of {plain}"):
         return
-    whole = inflater.eof and not inflater.unused_data and end >= len(data)
+    whole = inflater.eof and not inflater.unused_data and at >= end
     file.require(whole, f"{name}: the Zstandard frame is cut off or followed by more")
     file.require(found == plain, f"{name}: inflates to {found} bytes, uncompressedByteLength is {plain}")

@@ -19,6 +19,7 @@ from kiln_schemas.tasks import Artifact, FitMetrics, FitResult
 from kiln_workers.package import charts, colour
 from kiln_workers.package.gates import Judgement
 from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelPreview
+from kiln_workers.scene.picture import thinned
 from kiln_workers.scene.texel_map import COARSE
 from kiln_workers.sphere import octahedral
 
@@ -94,7 +95,7 @@ def render(report: ReportInput) -> bytes:
         ],
         stages=_stages(manifest.stage_seconds),
         atlas=charts.data_uri(report.preview.atlas),
-        irradiance=charts.data_uri(_irradiance_picture(report.irradiance, report.covered)),
+        irradiance=charts.data_uri(_irradiance_picture(thinned(report.irradiance), thinned(report.covered))),
         colour_bar=charts.colour_bar_uri(),
         files=sorted(manifest.files, key=_file_order),
     )
@@ -180,7 +181,7 @@ def _function_view(
         pictures = light_field_pictures(texel, function, fit.exposure)
         uris = [charts.data_uri(picture) for picture in pictures]
         view["texels"].append({"label": label, "texel": texel, "uris": uris})
-    picture, low, high = charts.heat_map(preview.errors)
+    picture, low, high = charts.heat_map(thinned(preview.errors))
     height, width = preview.errors.shape
     marks = [
         {"letter": label[0].upper(), "x": 100.0 * (t.column + 0.5) / width, "y": 100.0 * (t.row + 0.5) / height}

@@ -86,34 +86,45 @@ class Stitcher:
     """Solves for the seams of one light map; the factorisation is shared by all of its channels."""
 
     def __init__(self, scene: Scene, fill: Fill) -> None:
-        """`fill` says which texels [H, W] have data of their own."""
-        height, width = fill.distance.shape
+        """`fill` says which texels [H, W] have data of their own; `texels` are those near seams, row * W + column."""
+        height, width = fill.valid.shape
         self.points = seam_points(scene, max(height, width))
         sides = [bilinear(points, height, width) for points in (self.points.first, self.points.second)]
-        self._texels, unknown = np.unique(np.concatenate([texels for texels, _ in sides], axis=1), return_inverse=True)
-        count = len(self._texels)
+        self.texels, unknown = np.unique(np.concatenate([texels for texels, _ in sides], axis=1), return_inverse=True)
+        count = len(self.texels)
         if not count:
             return
         entries = np.concatenate([sides[0][1], -sides[1][1]], axis=1)
         places = (np.repeat(np.arange(len(entries)), 8), unknown.ravel())
         self._jump = csc_array(coo_array((entries.ravel(), places), shape=(len(entries), count)))
-        anchor = np.where(fill.distance.ravel()[self._texels] == 0.0, ANCHOR, FILLED)
+        anchor = np.where(fill.valid.ravel()[self.texels], ANCHOR, FILLED)
         self._factors = splu(csc_array(self._jump.T @ self._jump + diags_array(anchor)))
 
     def stitch(self, values: Float32) -> Float32:
         """The filled map [H, W, ...] with its seams closed; texels away from seams keep their values."""
-        if not len(self._texels):
+        if not len(self.texels):
             return values
         flat = values.reshape(values.shape[0] * values.shape[1], -1).copy()
-        before = flat[self._texels].astype(np.float64)
-        # The change d = x - y solves (J'J + diag r) d = -J'J y.
-        flat[self._texels] = before + self._factors.solve(-(self._jump.T @ (self._jump @ before)))
+        flat[self.texels] = self.solved(flat[self.texels])
         return flat.reshape(values.shape)
+
+    def solved(self, values: Float32) -> Float64:
+        """The closed seams' values [M, C] at `texels`, from those before."""
+        before = values.astype(np.float64)
+        if not len(before):
+            return before
+        # The change d = x - y solves (J'J + diag r) d = -J'J y.
+        return np.asarray(before + self._factors.solve(-(self._jump.T @ (self._jump @ before))))
+
+    def within(self, rows: slice, width: int) -> tuple[slice, Int64]:
+        """Which of `texels` lie in some rows, and their numbers from the first of these rows on."""
+        first, last = np.searchsorted(self.texels, [rows.start * width, rows.stop * width]).tolist()
+        return slice(first, last), self.texels[first:last] - rows.start * width
 
     def jumps(self, values: Float32) -> Float64:
         """Differences [S, ...] of the map [H, W, ...] across each seam point."""
         flat = values.reshape(values.shape[0] * values.shape[1], -1)
-        out = self._jump @ flat[self._texels].astype(np.float64)
+        out = self._jump @ flat[self.texels].astype(np.float64)
         return np.asarray(out.reshape(len(out), *values.shape[2:]))
 
 

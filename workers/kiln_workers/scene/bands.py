@@ -15,14 +15,12 @@ import numpy.typing as npt
 
 BAND_TEXELS: Final = 1 << 17
 """Texels of a band, about."""
-BAND_ROWS: Final = 16
-"""A band has a multiple of so many rows: an OpenEXR file is compressed in blocks of them."""
 
 
-def bands(shape: tuple[int, ...]) -> Iterator[slice]:
-    """The rows of a map [H, W, ...], cut into bands of about BAND_TEXELS texels."""
+def bands(shape: tuple[int, ...], share: int = 1) -> Iterator[slice]:
+    """The rows of a map [H, W, ...], cut into bands of about BAND_TEXELS texels, or a part of that."""
     height, width = shape[:2]
-    rows = max(BAND_TEXELS // width // BAND_ROWS, 1) * BAND_ROWS
+    rows = max(BAND_TEXELS // share // width, 1)
     for first in range(0, height, rows):
         yield slice(first, min(first + rows, height))
 

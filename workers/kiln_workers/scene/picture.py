@@ -4,7 +4,8 @@ Validity: green is valid, red is inside geometry, dark is gutter. Density: metre
 blue (fine) to yellow (coarse). Charts: one colour each.
 """
 
-from typing import Final
+from dataclasses import fields
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -18,11 +19,19 @@ RAMP: Final = np.array(
     [[38, 60, 160], [34, 130, 170], [70, 180, 120], [190, 205, 80], [252, 226, 70]], dtype=np.float64
 )
 PANEL_PIXELS: Final = 256
+MOST_PIXELS: Final = 2048
 GAP_PIXELS: Final = 8
+
+
+def thinned(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Every k-th row and column of a map [H, W, ...], so that a picture of it has at most MOST_PIXELS a side."""
+    step = -(-max(values.shape[:2]) // MOST_PIXELS)
+    return values[::step, ::step]
 
 
 def texel_map_picture(texels: TexelMap) -> npt.NDArray[np.uint8]:
     """The picture [h, w, 3]; each panel has at least 256 pixels a side, row 0 of the map on top."""
+    texels = TexelMap(**{field.name: np.array(thinned(getattr(texels, field.name))) for field in fields(texels)})
     panels = [_state_panel(texels), _density_panel(texels), _chart_panel(texels)]
     factor = max(1, -(-PANEL_PIXELS // texels.state.shape[0]))
     large = [panel.repeat(factor, axis=0).repeat(factor, axis=1) for panel in panels]

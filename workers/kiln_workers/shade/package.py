@@ -38,6 +38,7 @@ from kiln_workers.scene.gltf import read_gltf
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.origin import about_own_centre
 from kiln_workers.shade import algorithm, textures
+from kiln_workers.shade.lobe_file import LobeFile
 
 Float32 = npt.NDArray[np.float32]
 
@@ -67,8 +68,8 @@ class Incident(Protocol):
 class LobeTextures:
     """Incident light from the lobe textures."""
 
-    light_field: Tensor  # [H, W, N, 7]
-    visibility_lobes: Tensor | None  # [H, W, N, 7]; None without an environment
+    light_field: Tensor | LobeFile  # [H, W, N, 7]
+    visibility_lobes: Tensor | LobeFile | None  # [H, W, N, 7]; None without an environment
 
     def reflected(self, uv: Tensor, surface: algorithm.Surface, paper: bool = False) -> Tensor:
         lobes = algorithm.unit_lobes(textures.bilinear(self.light_field, uv))
@@ -128,18 +129,19 @@ class ShadePackage:
         return cls.of(folder, read_manifest(folder), device)
 
     @classmethod
-    def of(cls, folder: Path, manifest: Manifest, device: torch.device) -> Self:
-        """The same of a package whose manifest is not written yet."""
+    def of(cls, folder: Path, manifest: Manifest, device: torch.device, *, lobes_in_files: bool = False) -> Self:
+        """The same of a package whose manifest is not written yet. Lobes may stay in their files."""
         scene = about_own_centre(read_gltf(folder, SCENE_GLB))
         for mesh in scene.meshes:
             if mesh.lightmap_uv is None:
                 raise InputError("has no TEXCOORD_1", where=f"{folder / SCENE_GLB}: {mesh.name}")
-        visible = _lobes(folder, VISIBILITY_KTX2, manifest, device) if VISIBILITY_KTX2 in manifest.textures else None
+        lobes = _lobes_in_file if lobes_in_files else _lobes
+        visible = lobes(folder, VISIBILITY_KTX2, manifest, device) if VISIBILITY_KTX2 in manifest.textures else None
         return cls(
             manifest=manifest,
             scene=scene,
             irradiance=torch.from_numpy(read_exr(folder / IRRADIANCE_EXR, _irradiance_texels(manifest))).to(device),
-            lobes=LobeTextures(_lobes(folder, LIGHT_FIELD_KTX2, manifest, device), visible),
+            lobes=LobeTextures(lobes(folder, LIGHT_FIELD_KTX2, manifest, device), visible),
             environment=_environment(folder, manifest, device),
         )
 
@@ -218,9 +220,18 @@ def _irradiance_texels(manifest: Manifest) -> int:
 
 
 def _lobes(folder: Path, name: str, manifest: Manifest, device: torch.device) -> Tensor:
-    most = ktx2.TEXEL_BYTES * LAYERS_PER_LOBE * manifest.settings.fit.lobes * _texels(manifest)
-    texture = ktx2.read(folder / name, most)
+    texture = ktx2.read(folder / name, _most_bytes(manifest))
     return torch.from_numpy(layers_to_lobes(texture.levels[0][:, 0])).to(device)
+
+
+def _lobes_in_file(folder: Path, name: str, manifest: Manifest, device: torch.device) -> LobeFile:
+    layers, shape = ktx2.map_layers(folder / name, _most_bytes(manifest))
+    return LobeFile(layers, shape.height, shape.width, device)
+
+
+def _most_bytes(manifest: Manifest) -> int:
+    """Of a lobe texture's texels."""
+    return ktx2.TEXEL_BYTES * LAYERS_PER_LOBE * manifest.settings.fit.lobes * _texels(manifest)
 
 
 def _environment(folder: Path, manifest: Manifest, device: torch.device) -> EnvironmentLookup | None:

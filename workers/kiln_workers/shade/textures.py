@@ -7,8 +7,10 @@ eight bits. Octahedral and cube maps follow `kiln_schemas.conventions` and the O
 import torch
 from torch import Tensor
 
+from kiln_workers.shade.lobe_file import LobeFile
 
-def bilinear(image: Tensor, uv: Tensor) -> Tensor:
+
+def bilinear(image: Tensor | LobeFile, uv: Tensor) -> Tensor:
     """Values [P, ...] of an image [H, W, ...] at coordinates [P, 2] in [0, 1], u along columns; edges clamped."""
     rows, columns, weights = corners(image.shape[0], image.shape[1], uv)
     tail = (1,) * (image.ndim - 2)

@@ -161,7 +161,8 @@ def _view(name: str, camera: Camera, picture: Float32, reference: Reference, val
 def shaded(folder: Path, manifest: Manifest, camera: Camera, size: tuple[int, int]) -> Float32:
     """What the package in `folder` looks like, [H, W, 3]; `size` is width and height."""
     cuda = select_variant().startswith("cuda")
-    package = ShadePackage.of(folder, manifest, torch.device("cuda" if cuda else "cpu"))
+    device = torch.device("cuda" if cuda else "cpu")
+    package = ShadePackage.of(folder, manifest, device, lobes_in_files=True)
     return shade(package, render_gbuffer(package.scene, camera, *size))
 
 

@@ -17,7 +17,7 @@ from kiln_schemas.settings import FitSettings, Function, PackagedScene, PackageS
 from kiln_schemas.tasks import FitMetrics, FitResult, PackagePayload, PackageResult, RefineResult, Tile
 from kiln_workers.fit.metrics import TexelErrors, texel_errors
 from kiln_workers.fit.predict import Weights, predict
-from kiln_workers.fit.source import valid_texels
+from kiln_workers.fit.source import VALID, valid_texels
 from kiln_workers.fit.verdict import failure, has_failed, is_negligible
 from kiln_workers.package.build import EnvironmentTextures, LobeMap, PackageInput, build_package
 from kiln_workers.package.half import as_stored
@@ -26,9 +26,10 @@ from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelP
 from kiln_workers.render.environment import environment_u, ggx_prefilter, panorama
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import unpack_scene
+from kiln_workers.scene.bands import bands, mapped, release
 from kiln_workers.scene.model import Environment, Scene
 from kiln_workers.scene.picture import texel_map_picture
-from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
+from kiln_workers.scene.texel_map import TexelMap, TexelState, open_texel_map
 from kiln_workers.sphere.gaussian import evaluate
 from kiln_workers.sphere.octahedral import pixel_directions
 from kiln_workers.stages.bundle import lay_out
@@ -56,7 +57,7 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
     """All artifacts of a job, uploaded as blobs."""
     began = time.perf_counter()
     scene = unpack_scene(context.blob(payload.prepare.scene))
-    texel_map = with_render_verdict(unpack_texel_map(context.blob(payload.prepare.texel_map)), payload.renders)
+    texel_map = with_render_verdict(open_texel_map(context.blob_path(payload.prepare.texel_map)), payload.renders)
     store = LightFieldStore.open(payload.store_url)
     store.write_texel_map({name: getattr(texel_map, name) for name in TEXEL_MAP_ARRAYS})
     tiles = tuple(sorted((render.tile for render in payload.renders), key=lambda tile: (tile.row, tile.column)))
@@ -118,7 +119,7 @@ def _irradiance(
     """The irradiance map's texels and values [H, W, 3]: the finer ones where the bake has rendered them."""
     if payload.prepare.fine is None:
         return texel_map, store.read_irradiance(tiles)
-    finer = unpack_texel_map(context.blob(payload.prepare.fine))
+    finer = open_texel_map(context.blob_path(payload.prepare.fine))
     irradiance = store.read_fine_irradiance(tiles)
     return without_texels(finer, np.asarray((irradiance < 0.0).any(axis=2))), np.maximum(irradiance, 0.0)
 
@@ -162,32 +163,40 @@ def _judge(
     """Lobes of every valid texel as the texture will hold them, their errors, and the texels to show.
 
     The lobes are those of the refined blocks, or the network's output, which the fit has judged, where there are none.
-    Refined lobes that have failed are left out where the light field is too weak to be seen, else FitFailed.
+    Refined lobes that have failed are left out where the light field is too weak to be seen, else FitFailed. The lobes
+    lie in a file.
     """
     weights = Weights.from_bytes(context.blob(fit.weights))
     shape = texels.map.state.shape
-    lobes = np.zeros((*shape, weights.shape.lobes, 7), np.float32)
+    lobes = mapped(context.scratch / f"lobes-{fit.function}", (*shape, weights.shape.lobes, 7), np.float16)
     mask = np.zeros(shape, bool)
     per_texel = np.full(shape, np.nan, np.float32)
-    refined = _refined(refines, lobes, context) if refines else None
+    _take_refined(refines, lobes, context)
+    valid = int(np.count_nonzero(texels.map.state == VALID))
+    sums = mapped(context.scratch / f"sums-{fit.function}", (3, valid or 1), np.float64)
 
     def measured() -> TexelErrors:
-        parts = []
+        done = 0
         for place, images, normals in texels.batches():
-            found = predict(weights, images, normals, threads=context.threads) if refined is None else refined[place]
-            stored = as_stored(found)
-            errors = texel_errors(stored, images, normals, weights.exposure)
-            lobes[place], mask[place] = stored, True
+            if not refines:
+                lobes[place] = as_stored(predict(weights, images, normals, threads=context.threads))
+            errors = texel_errors(lobes[place].astype(np.float32), images, normals, weights.exposure)
+            mask[place] = True
             per_texel[place] = errors.error / errors.weight
-            parts.append(errors)
-        return TexelErrors.join(parts)
+            sums[:, done : done + len(images)] = errors.error, errors.zero, errors.weight
+            done += len(images)
+            release(lobes, sums)
+            texels.map.release()
+        return TexelErrors(*sums[:, :done])
 
     total, signal = measured(), fit.metrics.signal
-    if refined is not None and signal and has_failed(total):
+    if refines and signal and has_failed(total):
         irradiance = texels.store.read_irradiance(texels.tiles)[texels.map.state == TexelState.VALID]
         if not is_negligible(weights.exposure, irradiance):
             raise failure(total, fit.function, "refine_steps", settings.refine_steps, settings.lobes)
-        refined[..., 4:] = 0.0
+        for rows in bands(shape):
+            lobes[rows][mask[rows], :, 4:] = 0.0
+            release(lobes)
         total, signal = measured(), False
     metrics = FitMetrics(
         log_mse=total.log_mse,
@@ -200,18 +209,17 @@ def _judge(
     return LobeMap(lobes, mask), metrics, FunctionPreview(best, median, worst, per_texel)
 
 
-def _refined(refines: Sequence[RefineResult], like: Float32, context: Context) -> Float32:
-    """The refined lobes of all blocks in one map [H, W, N, 7]; InternalError where a block is not whole."""
-    out = np.zeros_like(like)
+def _take_refined(refines: Sequence[RefineResult], lobes: npt.NDArray[np.float16], context: Context) -> None:
+    """Write the refined lobes of all blocks into the map, as stored; InternalError where a block is not whole."""
     for refine in refines:
-        place, lobes = read_lobes(context.blob(refine.lobes))
-        if len(lobes) != refine.texels:
-            raise InternalError(f"block {refine.block.row},{refine.block.column} has {len(lobes)} texels")
-        out[place] = lobes
-    return out
+        place, found = read_lobes(context.blob(refine.lobes))
+        if len(found) != refine.texels:
+            raise InternalError(f"block {refine.block.row},{refine.block.column} has {len(found)} texels")
+        lobes[place] = as_stored(found)
+        release(lobes)
 
 
-def _preview(texels: _Texels, lobes: Float32, errors: Float32, at: tuple[int, int]) -> TexelPreview:
+def _preview(texels: _Texels, lobes: Float16, errors: Float32, at: tuple[int, int]) -> TexelPreview:
     original = texels.image(*at).astype(np.float32)
     size = original.shape[0]
     predicted = evaluate(pixel_directions(size).reshape(-1, 3), lobes[at].astype(np.float64))

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kiln_schemas.tasks import RenderResult, Tile
+from kiln_workers.scene.bands import bands
 from kiln_workers.scene.texel_map import TexelMap, TexelState
 
 Ints = npt.NDArray[np.int64]
@@ -53,8 +54,19 @@ def with_render_verdict(texel_map: TexelMap, renders: Iterable[RenderResult]) ->
 
 def without_texels(texel_map: TexelMap, inside: npt.NDArray[np.bool_]) -> TexelMap:
     """The texel map with the texels `inside` [H, W] geometry marked invalid, except for charts that wholly are."""
-    state = texel_map.state.copy()
+    state = np.array(texel_map.state)
     state[inside] = TexelState.INVALID
-    somewhere = np.unique(texel_map.chart[state == TexelState.VALID])
-    state[(state == TexelState.INVALID) & ~np.isin(texel_map.chart, somewhere)] = TexelState.VALID
+    somewhere = np.zeros(0, bool)  # by the chart's number
+    for rows in bands(state.shape):
+        charts = texel_map.chart[rows][state[rows] == TexelState.VALID]
+        found = np.zeros(max(len(somewhere), int(charts.max(initial=-1)) + 1), bool)
+        found[: len(somewhere)] = somewhere
+        found[charts] = True
+        somewhere = found
+    for rows in bands(state.shape):
+        row, column = np.nonzero(state[rows] == TexelState.INVALID)
+        charts = texel_map.chart[rows][row, column]
+        filled = (charts < len(somewhere)) & somewhere[np.minimum(charts, len(somewhere) - 1)] if len(somewhere) else 0
+        state[rows][row, column] = np.where(filled, TexelState.INVALID, TexelState.VALID)
+    texel_map.release()
     return replace(texel_map, state=state)
