@@ -36,10 +36,10 @@ class UvPolicy(StrEnum):
 
 
 class Solver(StrEnum):
-    """How the light field's lobes are found."""
+    """How the lobes of both functions are found."""
 
     COHERENT = "coherent"
-    """The network as the start, then gradient descent on all lobes at once, at texels and between them."""
+    """Gradient descent on all lobes at once, at texels and between them; on few texels of the light map first."""
     CNN = "cnn"
     """The network's own output (Currius et al. 2020)."""
 
@@ -134,25 +134,36 @@ class RenderSettings(Contract):
 
 
 class FitSettings(Contract):
-    """How light-field images become lobes: the training of the network, and the descent that starts from it."""
+    """How images become lobes: by the coherent descent or by the network."""
 
     solver: Solver = Solver.COHERENT
     lobes: int = Field(ge=1, le=64, description="spherical Gaussians per texel")
-    steps: int = Field(ge=1, le=1_000_000, description="optimiser steps of the light field's network, used as it is")
-    start_steps: int = Field(default=200, ge=1, le=1_000_000, description="the same where the coherent descent follows")
-    visibility_steps: int = Field(default=1000, ge=1, le=1_000_000, description="of the visibility's: it is far easier")
+    steps: int = Field(ge=1, le=1_000_000, description="optimiser steps of the light field's network (solver cnn)")
+    start_steps: int = Field(
+        default=400, ge=1, le=1_000_000, description="steps of the coherent descent on few texels of the light map"
+    )
+    visibility_steps: int = Field(
+        default=1000, ge=1, le=1_000_000, description="optimiser steps of the visibility's network (solver cnn)"
+    )
     batch: int = Field(default=32, ge=1, le=1024, description="texels per step")
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
     window: int = Field(default=4096, ge=1, le=1_000_000, description="texels in the shuffle window")
-    refine_steps: int = Field(default=600, ge=1, le=1_000_000, description="steps of the coherent descent")
+    refine_steps: int = Field(
+        default=800, ge=1, le=1_000_000, description="steps of the coherent descent on all texels"
+    )
+    visibility_refine_steps: int = Field(
+        default=200, ge=1, le=1_000_000, description="the same for the visibility, which is far easier"
+    )
     block: int = Field(default=32, ge=8, le=256, description="texels along each side of a refine task's block")
     checkpoint_s: float = Field(default=60.0, ge=1.0, le=3600.0, description="seconds between checkpoints")
 
     def steps_key(self, function: Function) -> str:
-        """Which field says how many steps the network of a function is trained for."""
-        if function is Function.VISIBILITY:
-            return "visibility_steps"
-        return "steps" if self.solver is Solver.CNN else "start_steps"
+        """Which field says how many steps a function's network is trained for."""
+        return "visibility_steps" if function is Function.VISIBILITY else "steps"
+
+    def refine_steps_key(self, function: Function) -> str:
+        """Which field says how many steps the descent on all texels takes."""
+        return "visibility_refine_steps" if function is Function.VISIBILITY else "refine_steps"
 
 
 class PackagedScene(StrEnum):
@@ -212,7 +223,7 @@ PRESETS: Final[Mapping[str, BakeSettings]] = {
         preset="production",
         lightmap=LightmapSettings(density=22.0, least=512, most=1024, irradiance_scale=2),
         render=RenderSettings(image_size=128, samples=128, irradiance_samples=4096, max_depth=8),
-        fit=FitSettings(lobes=16, steps=60_000, start_steps=1000, visibility_steps=24_000),
+        fit=FitSettings(lobes=16, steps=60_000, visibility_steps=24_000),
         package=PackageSettings(environment_size=256),
     ),
 }

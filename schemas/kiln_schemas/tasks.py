@@ -122,7 +122,7 @@ class FitPayload(Contract):
 
 
 class RefinePayload(Contract):
-    """Make the lobes of a block coherent, from the network's (`kiln_workers.fit.solvers.joint`)."""
+    """Find the lobes of a block by the coherent descent (`kiln_workers.fit.solvers.joint`)."""
 
     kind: Literal[TaskKind.REFINE] = TaskKind.REFINE
     block: Block
@@ -130,7 +130,8 @@ class RefinePayload(Contract):
     between: Between = ()
     renders: Renders
     """Of the tiles within the block and `conventions.REFINE_HALO` texels around it."""
-    fit: "FitResult"
+    fits: tuple["FitResult", ...] = Field(max_length=len(Function))
+    """What the descent of each function starts from."""
     settings: BakeSettings
     store_url: Url
 
@@ -144,7 +145,7 @@ class PackagePayload(Contract):
     renders: Renders
     fits: tuple["FitResult", ...] = Field(max_length=len(Function))
     refines: tuple["RefineResult", ...] = Field(default=(), max_length=MOST_TILES)
-    """Of the light field, one a block; none where the network's lobes are final."""
+    """One a block; none where the network's lobes are final."""
     settings: BakeSettings
     store_url: Url
     gates: Gates = Gates()
@@ -236,7 +237,7 @@ class RefineResult(Contract):
     kind: Literal[TaskKind.REFINE] = TaskKind.REFINE
     block: Block
     lobes: Sha256
-    """Lobes [T, N, 7] in scene units of the block's T valid texels, row by row (`kiln_workers.fit.solvers.joint`)."""
+    """Lobes [T, N, 7] of each function in scene units, of the block's T valid texels row by row (`stages.refine`)."""
     texels: Count
     steps: Count
     seconds: Seconds

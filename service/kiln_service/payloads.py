@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from kiln_schemas.conventions import REFINE_HALO
-from kiln_schemas.settings import Function
 from kiln_schemas.tasks import (
     Block,
     Claim,
@@ -68,14 +67,13 @@ async def build_payload(tx: Tx, job: JobRow, task: TaskRow) -> Built:
         case TaskKind.REFINE:
             prepared = _prepared_blobs(job)
             block = Block.model_validate(task.spec["block"])
-            fits = await _fits(tx, job)
             refine = RefinePayload(
                 **common,
                 block=block,
                 texel_map=prepared["texel_map"],
                 between=prepared["between"],
                 renders=await _renders_near(tx, job, block),
-                fit=next(result for result in fits if result.function is Function.LIGHT_FIELD),
+                fits=await _fits(tx, job),
             )
             return Built(refine, {})
         case TaskKind.PACKAGE:

@@ -28,7 +28,7 @@ from kiln_workers.scene.examples import write_exr
 
 SMALL = (
     *("lightmap.tile=4", "render.irradiance_samples=16", "fit.lobes=4", "fit.start_steps=60"),
-    *("fit.visibility_steps=60", "fit.refine_steps=20", "fit.checkpoint_s=1"),
+    *("fit.visibility_refine_steps=20", "fit.refine_steps=20", "fit.checkpoint_s=1"),
 )
 """Tasks so short that the time to the next one committed is that of the recovery and not of the task."""
 OVER = ("completed", "gate-failed", "failed", "canceled")

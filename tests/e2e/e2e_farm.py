@@ -21,7 +21,7 @@ from kiln_workers.scene.model import Material, Mesh, Scene
 
 TINY = (
     *("lightmap.resolution=16", "lightmap.tile=8", "render.image_size=16", "render.samples=8"),
-    *("render.irradiance_samples=64", "fit.lobes=6", "fit.start_steps=400", "fit.visibility_steps=400"),
+    *("render.irradiance_samples=64", "fit.lobes=6", "fit.start_steps=100", "fit.visibility_refine_steps=60"),
     *("fit.batch=16", "fit.refine_steps=60", "fit.block=8", "render.between_samples=8", "package.environment_size=16"),
     "package.pictures=off",
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from kiln_schemas.errors import Canceled
-from kiln_schemas.settings import BakeSettings, Function
+from kiln_schemas.settings import BakeSettings, Function, Solver
 from kiln_schemas.tasks import (
     Bundle,
     EnvironmentRef,
@@ -140,9 +140,8 @@ def bake_files(
     )
     functions = [Function.LIGHT_FIELD] + ([Function.VISIBILITY] if prepared.has_environment else [])
     fits = tuple(fit.run(FitPayload(function=f, renders=renders, **maps), context) for f in functions)
-    refine_payloads = tuple(
-        RefinePayload(block=block, renders=renders, fit=fits[0], **placed) for block in plan_blocks(prepared, settings)
-    )
+    blocks = plan_blocks(prepared, settings) if settings.fit.solver is Solver.COHERENT else []
+    refine_payloads = tuple(RefinePayload(block=block, renders=renders, fits=fits, **placed) for block in blocks)
     refines = tuple(refine.run(each, context) for each in refine_payloads)
     packaged = package.run(
         PackagePayload(

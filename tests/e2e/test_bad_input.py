@@ -134,7 +134,7 @@ def test_a_bake_of_a_bad_scene_leaves_nothing(folder: Path) -> None:
 def test_a_bake_that_failed_begins_anew(room_files: tuple[Path, Path], folder: Path) -> None:
     """A fit that failed is exit code 4 and no package; --resume submits a new job, not the old verdict again."""
     out = folder / "out"
-    few = settings("fit.start_steps=1", "fit.refine_steps=1")
+    few = settings("fit.start_steps=1", "fit.refine_steps=1", "fit.visibility_refine_steps=1")
     done = lightkiln("bake", room_files[0], "--preset", "draft", *few, "--out", out, "--json")
     assert (done.returncode, json.loads(done.stdout)["code"]) == (4, "fit-failed")
     assert [path.name for path in out.iterdir()] == [".lightkiln"]

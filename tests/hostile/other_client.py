@@ -18,7 +18,7 @@ from e2e_farm import TINY
 
 SMALL: Final = (
     *("lightmap.tile=4", "render.irradiance_samples=16", "fit.lobes=4", "fit.start_steps=60"),
-    *("fit.visibility_steps=60", "fit.refine_steps=20"),
+    *("fit.visibility_refine_steps=20", "fit.refine_steps=20"),
 )
 TAG: Final = "honest"
 """Of the client's jobs and of the worker that does them: it is not robbed of its tasks, which a worker may claim."""

@@ -177,7 +177,7 @@ def test_a_node_for_fit_and_refine_runs_both_without_a_renderer(coordinator, wor
         block=Block(row=32, column=64, size=32),
         texel_map="0" * 64,
         renders=(),
-        fit=fit,
+        fits=(fit,),
         settings=PRESETS["draft"],
         store_url="file:///store",
     )

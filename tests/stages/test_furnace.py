@@ -96,7 +96,7 @@ def test_a_ball_in_a_constant_environment(tmp_path: Path) -> None:
     ball = patch("ball", sphere(np.zeros(3), 1.0), (24, 24), Cell(0, 0, 32, 32), 0)
     white = Material("white metal", (1.0, 1.0, 1.0, 1.0), metallic=1.0, roughness=0.6)
     environment = Environment(np.full((8, 16, 3), 0.8, np.float32))
-    settings = make_settings("draft", [*TINY, "fit.visibility_steps=1000"])
+    settings = make_settings("draft", [*TINY, "fit.visibility_refine_steps=400"])
     package = read(
         bake(tmp_path, Scene((ball,), (white,), environment=environment), settings).download(tmp_path / "package")
     )

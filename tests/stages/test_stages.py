@@ -26,7 +26,9 @@ from kiln_schemas.tasks import (
 )
 from kiln_workers.fit.metrics import TexelErrors, texel_errors
 from kiln_workers.fit.predict import Weights, predict
+from kiln_workers.fit.solvers.coherent import Start
 from kiln_workers.package import ktx2
+from kiln_workers.package.build import LOBE_FILES
 from kiln_workers.package.exr import write_rgb
 from kiln_workers.package.gates import Judgement
 from kiln_workers.package.glb import encode_glb
@@ -74,36 +76,45 @@ def _texture(baked: Baked, name: str) -> Any:
     return layers_to_lobes(ktx2.decode(baked.artifact(name)).levels[0][:, 0])
 
 
-def test_visibility_holds_the_networks_output(baked: Baked) -> None:
+def test_the_networks_output_is_what_a_package_holds_without_the_descent(tmp_path: Path) -> None:
     """At every valid texel the stored lobes are the network's, up to fp16: axes, sharpness and amplitude."""
-    stored, compared = _texture(baked, "visibility.ktx2"), 0
-    weights = Weights.from_bytes(baked.context.blob(baked.fits[1].weights))
-    for place, images, normals in _valid(baked, Function.VISIBILITY):
-        expected = predict(weights, images, normals)
-        np.testing.assert_allclose(stored[place], expected, rtol=2.0**-10, atol=2.0**-11)
-        compared += len(images)
-    assert compared == baked.fits[1].metrics.texels > 50
+    network = ["fit.solver=cnn", "fit.steps=400", "fit.visibility_steps=400"]
+    scene = replace(room(), environment=Environment(sky()))
+    baked = bake(tmp_path, scene, make_settings("draft", [*TINY, *network]))
+    assert not baked.refines
+    for fit in baked.fits:
+        stored, compared = _texture(baked, LOBE_FILES[fit.function]), 0
+        weights = Weights.from_bytes(baked.context.blob(fit.weights))
+        for place, images, normals in _valid(baked, fit.function):
+            expected = predict(weights, images, normals)
+            np.testing.assert_allclose(stored[place], expected, rtol=2.0**-10, atol=2.0**-11)
+            compared += len(images)
+        assert compared == fit.metrics.texels > 50
 
 
-def test_light_field_holds_the_refined_lobes(baked: Baked) -> None:
-    """Every valid texel is in one block; its lobes are the block's up to fp16, and better than the network's."""
-    stored, compared = _texture(baked, "lightfield.ktx2"), 0
+@pytest.mark.parametrize("function", list(Function))
+def test_a_function_holds_the_refined_lobes(baked: Baked, function: Function) -> None:
+    """Every valid texel is in one block; its lobes are the block's up to fp16, and better than those at the start."""
+    stored, compared = _texture(baked, LOBE_FILES[function]), 0
+    fit = next(fit for fit in baked.fits if fit.function is function)
+    start = Start.from_bytes(baked.context.blob(fit.weights))
+    texel_map = unpack_texel_map(baked.context.blob(baked.prepared.texel_map))
     for result in baked.refines:
-        place, lobes = refine.read_lobes(baked.context.blob(result.lobes))
+        place, lobes = refine.read_lobes(baked.context.blob(result.lobes), function)
         np.testing.assert_allclose(stored[place], lobes, rtol=2.0**-10, atol=2.0**-11)
         compared += result.texels
-    network = baked.fits[0].metrics
-    assert compared == network.texels > 50
-    weights = Weights.from_bytes(baked.context.blob(baked.fits[0].weights))
-    parts = [
-        texel_errors(stored[p].astype(np.float32), i, n, weights.exposure)
-        for p, i, n in _valid(baked, Function.LIGHT_FIELD)
-    ]
-    refined = TexelErrors.join(parts).log_mse
-    assert refined < network.log_mse
-    manifest = Manifest.model_validate_json(baked.artifact("manifest.json"))
-    assert manifest.metrics.light_field is not None
-    assert manifest.metrics.light_field.log_mse == pytest.approx(refined, rel=1e-3)
+    refined, before = [], []
+    for place, images, normals in _valid(baked, function):
+        refined.append(texel_errors(stored[place].astype(np.float32), images, normals, fit.exposure))
+        chart = texel_map.chart[place].astype(np.int64)
+        lobes = start.in_scene_units(start.at(np.stack(place, axis=1), chart))
+        before.append(texel_errors(lobes, images, normals, fit.exposure))
+    errors = TexelErrors.join(refined)
+    assert compared == len(errors.error) > fit.metrics.texels > 10
+    assert errors.log_mse < TexelErrors.join(before).log_mse
+    metrics = Manifest.model_validate_json(baked.artifact("manifest.json")).metrics
+    stated = metrics.light_field if function is Function.LIGHT_FIELD else metrics.visibility
+    assert stated is not None and stated.log_mse == pytest.approx(errors.log_mse, rel=1e-3)
 
 
 def without_light(baked: Baked) -> tuple[RefineResult, ...]:
@@ -111,9 +122,9 @@ def without_light(baked: Baked) -> tuple[RefineResult, ...]:
     out = []
     for result in baked.refines:
         body, arrays = unpack("lobes", baked.context.blob(result.lobes))
-        lobes = arrays["lobes"].copy()
+        lobes = arrays["light_field"].copy()
         lobes[..., 4:] = 0.0
-        blob = baked.context.put_blob(pack("lobes", body, {**arrays, "lobes": lobes}))
+        blob = baked.context.put_blob(pack("lobes", body, {**arrays, "light_field": lobes}))
         out.append(result.model_copy(update={"lobes": blob}))
     return tuple(out)
 

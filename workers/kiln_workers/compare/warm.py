@@ -49,4 +49,8 @@ def _of_bake(folder: Path, exposure: float | None) -> Weights:
             continue
         if weights.exposure == exposure:
             return weights
-    raise NotFound("the bake's network was not kept", where=str(folder), remedy="Bake it with `lightkiln bake --keep`.")
+    raise NotFound(
+        "no network of the light field was kept",
+        where=str(folder),
+        remedy="Bake it with `lightkiln bake --keep --set fit.solver=cnn`.",
+    )

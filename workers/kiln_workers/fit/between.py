@@ -20,20 +20,31 @@ Moved = Callable[[], tuple[TexelMap, ...]]
 def read_field(
     store: LightFieldStore, texel_map: TexelMap, tiles: Sequence[tuple[Tile, Index]], exposure: float, moved: Moved
 ) -> TexelField:
-    """The light fields of texels, tile by tile: a tile and row-major indices of valid texels inside of it."""
+    """The light fields of texels and between them, tile by tile: a tile and row-major indices of valid texels in it."""
+    field = read_texels(store, Function.LIGHT_FIELD, texel_map, tiles, exposure)
+    if not store.has_between or not len(field):
+        return field
+    return replace(field, traced=_read_between(store, field, moved(), tiles))
+
+
+def read_texels(
+    store: LightFieldStore,
+    function: Function,
+    texel_map: TexelMap,
+    tiles: Sequence[tuple[Tile, Index]],
+    exposure: float,
+) -> TexelField:
+    """The images of a function at the texels alone."""
     size = store.image_size
     images, places = [np.empty((0, size, size, 3), np.float16)], [np.empty((0, 2), np.int64)]
     for tile, inside in tiles:
         rows, columns = np.divmod(inside, tile.size)
         places.append(np.stack([rows + tile.row, columns + tile.column], axis=1))
-        images.append(store.read_tile(Function.LIGHT_FIELD, tile, inside))
+        images.append(store.read_tile(function, tile, inside))
     place = np.concatenate(places)
     at = place[:, 0], place[:, 1]
     chart = texel_map.chart[at].astype(np.int64)
-    field = TexelField(np.concatenate(images), texel_map.normal[at], place, chart, exposure)
-    if not store.has_between or not len(field):
-        return field
-    return replace(field, traced=_read_between(store, field, moved(), tiles))
+    return TexelField(np.concatenate(images), texel_map.normal[at], place, chart, exposure)
 
 
 def _read_between(

@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from kiln_schemas.conventions import EXPOSURE_KEY
+from kiln_schemas.conventions import EXPOSURE_KEY, LOBE_PARAMETERS
 from kiln_schemas.settings import Function
+from kiln_schemas.tasks import FitMetrics
 from kiln_workers.fit.lobes import amplitude_scale
 from kiln_workers.fit.loss import lobe_values
 from kiln_workers.fit.network import pixel_centres, solid_angles
@@ -24,6 +25,9 @@ Float64 = npt.NDArray[np.float64]
 
 LUMINANCE: Final = (0.2126, 0.7152, 0.0722)
 """Rec.709 luminance of linear RGB."""
+
+NO_SIGNAL: Final = 1e-10
+"""log_mse of P = 0 below which there is nothing to fit."""
 
 _TEXELS_AT_ONCE: Final = 16
 
@@ -100,6 +104,30 @@ def exposure_of(source: TexelSource, function: Function) -> float:
         light += float((weights * luminance).sum())
         weight += float(weights.sum())
     return EXPOSURE_KEY * weight / light if light > 0.0 else 1.0
+
+
+def has_signal(source: TexelSource, exposure: float) -> bool:
+    """Whether `log_mse_zero` over all texels, with 4 pi for each solid angle, is at least NO_SIGNAL."""
+    least = NO_SIGNAL * 4.0 * np.pi * sum(source.counts)
+    light = 0.0
+    for tile, count in enumerate(source.counts):
+        images = source.images(tile, np.arange(count, dtype=np.int64))
+        dark = np.zeros((count, 1, LOBE_PARAMETERS), np.float32)
+        light += float(texel_errors(dark, images, source.normals(tile), exposure).zero.sum())
+        if light >= least:
+            return True
+    return False
+
+
+def metrics_of(errors: TexelErrors, *, signal: bool) -> FitMetrics:
+    """The errors of all texels together, as results hold them."""
+    return FitMetrics(
+        log_mse=errors.log_mse,
+        log_mse_zero=errors.log_mse_zero,
+        log_mse_rel=errors.log_mse_rel,
+        texels=len(errors.error),
+        signal=signal,
+    )
 
 
 def _ratio(sums: Float64, weights: Float64) -> float:

@@ -16,6 +16,7 @@ from torch import Tensor
 from kiln_schemas.conventions import FORMAT_VERSION, FP16_MAX
 from kiln_schemas.errors import InputError
 from kiln_workers.fit.network import Shape, lobes, split
+from kiln_workers.fit.pooling import pooled
 from kiln_workers.fit.source import Float16, Float32
 from kiln_workers.fit.threads import single_threaded_pool
 from kiln_workers.scene.container import pack, unpack
@@ -61,6 +62,7 @@ class Weights:
 def predict(weights: bytes | Weights, images: Float16, normals: Float32, *, threads: int = 1) -> Float32:
     """Lobes [T, N, 7] in scene units of images [T, R, R, 3] with unit geometric normals [T, 3].
 
+    The network sees images of its own size: larger ones are pooled.
     Unit axes, positive sharpness, amplitudes within fp16 (textures round the lobes to it).
     """
     network = Weights.from_bytes(weights) if isinstance(weights, bytes) else weights
@@ -68,7 +70,7 @@ def predict(weights: bytes | Weights, images: Float16, normals: Float32, *, thre
     out = np.empty((len(images), network.shape.lobes, 7), np.float32)
 
     def one(texel: int) -> None:
-        picture = torch.from_numpy(images[texel : texel + 1])
+        picture = torch.from_numpy(pooled(images[texel : texel + 1], network.shape.image_size))
         normal = torch.from_numpy(normals[texel : texel + 1].astype(np.float32))
         with torch.inference_mode():
             out[texel] = _in_scene_units(lobes(layers, picture, normal, network.exposure), network).numpy()[0]

@@ -18,13 +18,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kiln_schemas.conventions import LOBE_PARAMETERS
 from kiln_schemas.errors import InputError
 from kiln_schemas.settings import FitSettings, Function
 from kiln_schemas.tasks import CurvePoint, FitMetrics, Progress
+from kiln_workers.fit.curve import Curve
 from kiln_workers.fit.lobes import constrain
 from kiln_workers.fit.loss import jittered_directions, log_loss, step_weights
-from kiln_workers.fit.metrics import TexelErrors, exposure_of, texel_errors
+from kiln_workers.fit.metrics import TexelErrors, exposure_of, has_signal, metrics_of, texel_errors
 from kiln_workers.fit.network import INPUT_GAIN, Shape, encode, initial_parameters, network_input, split
 from kiln_workers.fit.optimizer import Adam, one_cycle
 from kiln_workers.fit.predict import Weights, predict
@@ -35,9 +35,6 @@ from kiln_workers.fit.verdict import failure, has_failed
 from kiln_workers.scene.container import pack, unpack
 
 MICRO_BATCHES: Final = 4
-CURVE_POINTS: Final = 200
-NO_SIGNAL: Final = 1e-10
-"""log_mse of P = 0 below which there is nothing to fit."""
 
 _CHECKPOINT: Final = "fit-checkpoint"
 _PIXEL_STREAM: Final = 0x706978
@@ -67,9 +64,7 @@ class _State:
     adam: Adam
     exposure: float
     seconds: float = 0.0
-    curve: list[CurvePoint] = field(default_factory=list)
-    pending: list[float] = field(default_factory=list)
-    """Losses since the curve's last point."""
+    curve: Curve = field(default_factory=Curve)
 
 
 def train(
@@ -88,12 +83,11 @@ def train(
     on_epoch: Callable[[int, Weights], None] | None = None,
     start: Weights | None = None,
     is_negligible: Callable[[float], bool] = lambda exposure: False,
-    is_start: bool = False,
 ) -> FitOutcome:
     """Fit one function; FitFailed where it does not clearly beat P = 0, InputError where there are no texels.
 
     A function that `is_negligible` at its exposure (asked where the fit has failed) is left out instead: it is too weak
-    to be seen, and the network finds nothing in it. What a descent starts from (`is_start`) is not judged.
+    to be seen, and the network finds nothing in it.
 
     `exposure` is that of the source unless given; `on_epoch` is shown the weights after each pass over the texels;
     `start` is a network of the same shape to go on from, instead of random weights.
@@ -121,7 +115,7 @@ def train(
         state = _State(0, Adam.start(_first(shape, seed, start)), exposure)
     began -= state.seconds
     with single_threaded_pool(threads) as pool:
-        if checkpoint is None and _errors(source, None, state.exposure, pool).log_mse_zero < NO_SIGNAL:
+        if checkpoint is None and not has_signal(source, state.exposure):
             return _without_signal(source, shape, state, time.monotonic() - began)
         trainer = _Trainer(shape, settings, seed, device, pool, state)
         last_saved = time.monotonic()
@@ -137,8 +131,8 @@ def train(
                 last_saved = time.monotonic()
         weights = _weights(shape, state)
         errors = _errors(source, weights, state.exposure, pool)
-    metrics = _metrics(errors, signal=True)
-    if has_failed(errors) and not is_start:
+    metrics = metrics_of(errors, signal=True)
+    if has_failed(errors):
         if not is_negligible(state.exposure):
             raise failure(errors, function, settings.steps_key(function), settings.steps, settings.lobes)
         weights = replace(weights, signal=False)
@@ -147,7 +141,7 @@ def train(
         weights=weights.to_bytes(),
         exposure=state.exposure,
         metrics=metrics,
-        curve=tuple(state.curve),
+        curve=tuple(state.curve.points),
         steps=state.step,
         seconds=time.monotonic() - began,
     )
@@ -177,7 +171,7 @@ class _Trainer:
         rate = one_cycle(state.step, settings.steps, settings.learning_rate)
         state.step += 1
         state.adam.update([part for _, part in results], rate, state.step, self._run)
-        _extend_curve(state, sum(loss for loss, _ in results), settings.steps)
+        state.curve.add(state.step, sum(loss for loss, _ in results), settings.steps)
 
     def _run(self, work: Callable[[_In], _Out], parts: Iterable[_In]) -> Iterable[_Out]:
         """Map over the pool; one after the other on a GPU, which one stream of kernels keeps busy."""
@@ -210,8 +204,8 @@ def _first(shape: Shape, seed: int, start: Weights | None) -> Tensor:
     return torch.from_numpy(start.parameters.copy())
 
 
-def _errors(source: TexelSource, weights: Weights | None, exposure: float, pool: ThreadPoolExecutor) -> TexelErrors:
-    """Errors of all texels, tile by tile in order; without weights those of P = 0.
+def _errors(source: TexelSource, weights: Weights, exposure: float, pool: ThreadPoolExecutor) -> TexelErrors:
+    """Errors of all texels, tile by tile in order.
 
     Measured on lobes rounded to fp16, because that is what the textures hold.
     """
@@ -219,23 +213,10 @@ def _errors(source: TexelSource, weights: Weights | None, exposure: float, pool:
     def of_tile(tile: int) -> TexelErrors:
         images = source.images(tile, np.arange(source.counts[tile], dtype=np.int64))
         normals = source.normals(tile)
-        if weights is None:
-            lobes = np.zeros((len(images), 1, LOBE_PARAMETERS), np.float32)
-        else:
-            lobes = predict(weights, images, normals).astype(np.float16).astype(np.float32)
+        lobes = predict(weights, images, normals).astype(np.float16).astype(np.float32)
         return texel_errors(lobes, images, normals, exposure)
 
     return TexelErrors.join(pool.map(of_tile, range(len(source.counts))))
-
-
-def _metrics(errors: TexelErrors, *, signal: bool) -> FitMetrics:
-    return FitMetrics(
-        log_mse=errors.log_mse,
-        log_mse_zero=errors.log_mse_zero,
-        log_mse_rel=errors.log_mse_rel,
-        texels=len(errors.error),
-        signal=signal,
-    )
 
 
 def _without_signal(source: TexelSource, shape: Shape, state: _State, seconds: float) -> FitOutcome:
@@ -245,16 +226,8 @@ def _without_signal(source: TexelSource, shape: Shape, state: _State, seconds: f
     return FitOutcome(weights.to_bytes(), state.exposure, metrics, (), 0, seconds)
 
 
-def _extend_curve(state: _State, loss: float, steps: int) -> None:
-    state.pending.append(loss)
-    if state.step % max(1, steps // CURVE_POINTS) == 0 or state.step == steps:
-        state.curve.append(CurvePoint(step=state.step, loss=sum(state.pending) / len(state.pending)))
-        state.pending.clear()
-
-
 def _progress(state: _State, settings: FitSettings) -> Progress:
-    loss = state.curve[-1].loss if state.curve else state.pending[-1]
-    return Progress(done=state.step, total=settings.steps, unit="steps", loss=loss)
+    return Progress(done=state.step, total=settings.steps, unit="steps", loss=state.curve.last)
 
 
 def _save(state: _State, identity: Mapping[str, Any], seconds: float) -> bytes:
@@ -264,8 +237,8 @@ def _save(state: _State, identity: Mapping[str, Any], seconds: float) -> bytes:
         "step": state.step,
         "exposure": state.exposure,
         "seconds": seconds,
-        "curve": [[point.step, point.loss] for point in state.curve],
-        "pending": state.pending,
+        "curve": [[point.step, point.loss] for point in state.curve.points],
+        "pending": state.curve.pending,
     }
     arrays = {"parameters": adam.parameters, "mean": adam.mean, "square": adam.square}
     return pack(_CHECKPOINT, body, {name: value.cpu().numpy() for name, value in arrays.items()})
@@ -276,5 +249,5 @@ def _restore(checkpoint: bytes, identity: Mapping[str, Any]) -> _State:
     if body["identity"] != identity:
         raise InputError("the checkpoint belongs to another fit", where="checkpoint", remedy="Start without it.")
     adam = Adam(*(torch.from_numpy(arrays[name].copy()) for name in ("parameters", "mean", "square")))
-    curve = [CurvePoint(step=step, loss=loss) for step, loss in body["curve"]]
-    return _State(body["step"], adam, body["exposure"], body["seconds"], curve, body["pending"])
+    curve = Curve([CurvePoint(step=step, loss=loss) for step, loss in body["curve"]], body["pending"])
+    return _State(body["step"], adam, body["exposure"], body["seconds"], curve)

@@ -1,57 +1,81 @@
-"""Fit one function: stream the rendered tiles through the network until it is trained."""
+"""Fit one function: the network, trained on the rendered tiles, or what the coherent descent starts from."""
+
+import time
+from collections.abc import Mapping
+
+import numpy as np
+import torch
 
 from kiln_schemas.conventions import ARRAY_IRRADIANCE
 from kiln_schemas.settings import Function, Solver
-from kiln_schemas.tasks import FitPayload, FitResult, Progress
-from kiln_workers.fit.source import StoreSource, valid_texels
+from kiln_schemas.tasks import FitPayload, FitResult, Progress, Tile
+from kiln_workers.fit.between import read_texels
+from kiln_workers.fit.curve import Curve
+from kiln_workers.fit.metrics import exposure_of, has_signal, metrics_of, texel_errors
+from kiln_workers.fit.pooling import PooledSource
+from kiln_workers.fit.solvers.coherent import chosen_texels, find_start, stride
+from kiln_workers.fit.solvers.joint import CoherentOptions
+from kiln_workers.fit.source import Index, StoreSource, TexelSource, valid_texels
 from kiln_workers.fit.train import train
 from kiln_workers.fit.verdict import is_negligible
 from kiln_workers.runner.context import Context
-from kiln_workers.scene.texel_map import TexelState, unpack_texel_map
-from kiln_workers.stages.tiles import with_render_verdict
+from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
+from kiln_workers.stages.tiles import map_coordinates, with_render_verdict
 from kiln_workers.store.light_field import LightFieldStore
 
 
 def run(payload: FitPayload, context: Context) -> FitResult:
-    """Train from the store, going on from the last published checkpoint where there is one."""
+    """The function's lobes as far as a fit of the whole light map at once makes them."""
     texel_map = with_render_verdict(unpack_texel_map(context.blob(payload.texel_map)), payload.renders)
     tiles = sorted((render.tile for render in payload.renders), key=lambda tile: (tile.row, tile.column))
     store = LightFieldStore.open(payload.store_url)
-    source = StoreSource(store, payload.function, texel_map.state, texel_map.normal, tiles)
+    covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles}
+    with store.all_lost([payload.function.value, ARRAY_IRRADIANCE], covered):
+        if payload.settings.fit.solver is Solver.COHERENT:
+            result = _start(payload, context, store, texel_map, covered)
+        else:
+            result = _train(payload, context, store, texel_map, covered)
+    context.log(f"{payload.function.value}: log_mse_rel {result.metrics.log_mse_rel:.4f}")
+    return result
 
+
+def _train(
+    payload: FitPayload,
+    context: Context,
+    store: LightFieldStore,
+    texel_map: TexelMap,
+    covered: Mapping[Tile, Index],
+) -> FitResult:
+    """Train the network from the store, going on from the last published checkpoint where there is one."""
+    function, asked = payload.function, payload.settings.fit
+    source: TexelSource = StoreSource(store, function, texel_map.state, texel_map.normal, list(covered))
+    if function is Function.VISIBILITY:
+        source = PooledSource(source)
     checkpoint = context.last_checkpoint()
-    context.log(f"{payload.function.value}: {'going on from a checkpoint' if checkpoint else 'starting'}")
+    context.log(f"{function.value}: {'going on from a checkpoint' if checkpoint else 'starting'}")
 
     def on_progress(at: Progress) -> None:
         context.progress(at.done, at.total, at.unit, at.message, at.loss)
 
-    asked = payload.settings.fit
-    settings = asked.model_copy(update={"steps": getattr(asked, asked.steps_key(payload.function))})
-    covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles}
-
-    is_light_field = payload.function is Function.LIGHT_FIELD
-
     def negligible(exposure: float) -> bool:
         valid = texel_map.state == TexelState.VALID
-        return is_light_field and is_negligible(exposure, store.read_irradiance(tiles)[valid])
+        light = function is Function.LIGHT_FIELD
+        return light and is_negligible(exposure, store.read_irradiance(list(covered))[valid])
 
-    with store.all_lost([payload.function.value, ARRAY_IRRADIANCE], covered):
-        outcome = train(
-            source,
-            settings,
-            payload.function,
-            payload.settings.seed,
-            threads=context.threads,
-            checkpoint=checkpoint,
-            on_checkpoint=context.checkpoint,
-            on_progress=on_progress,
-            checkpoint_every_s=settings.checkpoint_s,
-            is_negligible=negligible,
-            is_start=is_light_field and settings.solver is Solver.COHERENT,
-        )
-    context.log(f"{payload.function.value}: log_mse_rel {outcome.metrics.log_mse_rel:.4f}")
+    outcome = train(
+        source,
+        asked.model_copy(update={"steps": getattr(asked, asked.steps_key(function))}),
+        function,
+        payload.settings.seed,
+        threads=context.threads,
+        checkpoint=checkpoint,
+        on_checkpoint=context.checkpoint,
+        on_progress=on_progress,
+        checkpoint_every_s=asked.checkpoint_s,
+        is_negligible=negligible,
+    )
     return FitResult(
-        function=payload.function,
+        function=function,
         weights=context.put_blob(outcome.weights),
         exposure=outcome.exposure,
         metrics=outcome.metrics,
@@ -59,3 +83,57 @@ def run(payload: FitPayload, context: Context) -> FitResult:
         steps=outcome.steps,
         seconds=outcome.seconds,
     )
+
+
+def _start(
+    payload: FitPayload,
+    context: Context,
+    store: LightFieldStore,
+    texel_map: TexelMap,
+    covered: Mapping[Tile, Index],
+) -> FitResult:
+    """Find what the coherent descent of all blocks starts from; its metrics are of the texels chosen for that."""
+    began = time.perf_counter()
+    settings = payload.settings.fit
+    source = StoreSource(store, payload.function, texel_map.state, texel_map.normal, list(covered))
+    exposure = exposure_of(source, payload.function)
+    chosen, step = _chosen(texel_map, covered)
+    field = read_texels(store, payload.function, texel_map, chosen, exposure)
+    options, curve = CoherentOptions(steps=settings.start_steps), Curve()
+
+    def on_step(done: int, _: torch.Tensor, loss: float) -> None:
+        curve.add(done, loss, options.steps)
+        context.progress(done, options.steps, "steps", loss=curve.last)
+
+    start = find_start(
+        field,
+        step,
+        settings.lobes,
+        options,
+        payload.settings.seed,
+        signal=has_signal(source, exposure),
+        threads=context.threads,
+        on_step=on_step,
+    )
+    errors = texel_errors(start.in_scene_units(start.lobes), field.images, field.normals, exposure)
+    return FitResult(
+        function=payload.function,
+        weights=context.put_blob(start.to_bytes()),
+        exposure=exposure,
+        metrics=metrics_of(errors, signal=start.signal),
+        curve=tuple(curve.points),
+        steps=options.steps,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _chosen(texel_map: TexelMap, covered: Mapping[Tile, Index]) -> tuple[list[tuple[Tile, Index]], int]:
+    """The texels that the start is sought for, tile by tile as `covered`, and how far they lie apart."""
+    place = np.concatenate([np.stack(map_coordinates(tile, inside), axis=1) for tile, inside in covered.items()])
+    chart = texel_map.chart[place[:, 0], place[:, 1]].astype(np.int64)
+    keep = np.zeros(len(place), bool)
+    keep[chosen_texels(place, chart)] = True
+    ends = np.cumsum([len(inside) for inside in covered.values()])
+    parts = np.split(keep, ends[:-1])
+    tiles = [(tile, inside[part]) for (tile, inside), part in zip(covered.items(), parts, strict=True)]
+    return [(tile, inside) for tile, inside in tiles if len(inside)], stride(len(place))

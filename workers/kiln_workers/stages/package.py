@@ -15,7 +15,7 @@ from kiln_schemas.errors import InternalError
 from kiln_schemas.job import check_bundle
 from kiln_schemas.settings import FitSettings, Function, PackagedScene, PackageSettings
 from kiln_schemas.tasks import FitMetrics, FitResult, PackagePayload, PackageResult, RefineResult, Tile
-from kiln_workers.fit.metrics import TexelErrors, texel_errors
+from kiln_workers.fit.metrics import TexelErrors, metrics_of, texel_errors
 from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.source import VALID, valid_texels
 from kiln_workers.fit.verdict import failure, has_failed, is_negligible
@@ -71,9 +71,8 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
     for number, fit in enumerate(payload.fits):
         context.progress(number, steps, "steps", f"evaluating the {fit.function.value}")
         texels = _Texels(store, texel_map, tiles, fit.function)
-        refines = payload.refines if fit.function is Function.LIGHT_FIELD else ()
         with store.all_lost([fit.function.value], covered):
-            judged = _judge(fit, refines, texels, payload.settings.fit, context)
+            judged = _judge(fit, payload.refines, texels, payload.settings.fit, context)
         lobes[fit.function], metrics[fit.function], previews[fit.function] = judged
 
     context.progress(steps - 2, steps, "steps", "convolving the environment")
@@ -166,21 +165,21 @@ def _judge(
     Refined lobes that have failed are left out where the light field is too weak to be seen, else FitFailed. The lobes
     lie in a file.
     """
-    weights = Weights.from_bytes(context.blob(fit.weights))
+    network = None if refines else Weights.from_bytes(context.blob(fit.weights))
     shape = texels.map.state.shape
-    lobes = mapped(context.scratch / f"lobes-{fit.function}", (*shape, weights.shape.lobes, 7), np.float16)
+    lobes = mapped(context.scratch / f"lobes-{fit.function}", (*shape, settings.lobes, 7), np.float16)
     mask = np.zeros(shape, bool)
     per_texel = np.full(shape, np.nan, np.float32)
-    _take_refined(refines, lobes, context)
+    _take_refined(refines, fit.function, lobes, context)
     valid = int(np.count_nonzero(texels.map.state == VALID))
     sums = mapped(context.scratch / f"sums-{fit.function}", (3, valid or 1), np.float64)
 
     def measured() -> TexelErrors:
         done = 0
         for place, images, normals in texels.batches():
-            if not refines:
-                lobes[place] = as_stored(predict(weights, images, normals, threads=context.threads))
-            errors = texel_errors(lobes[place].astype(np.float32), images, normals, weights.exposure)
+            if network is not None:
+                lobes[place] = as_stored(predict(network, images, normals, threads=context.threads))
+            errors = texel_errors(lobes[place].astype(np.float32), images, normals, fit.exposure)
             mask[place] = True
             per_texel[place] = errors.error / errors.weight
             sums[:, done : done + len(images)] = errors.error, errors.zero, errors.weight
@@ -192,27 +191,23 @@ def _judge(
     total, signal = measured(), fit.metrics.signal
     if refines and signal and has_failed(total):
         irradiance = texels.store.read_irradiance(texels.tiles)[texels.map.state == TexelState.VALID]
-        if not is_negligible(weights.exposure, irradiance):
-            raise failure(total, fit.function, "refine_steps", settings.refine_steps, settings.lobes)
+        if fit.function is Function.VISIBILITY or not is_negligible(fit.exposure, irradiance):
+            setting = settings.refine_steps_key(fit.function)
+            raise failure(total, fit.function, setting, getattr(settings, setting), settings.lobes)
         for rows in bands(shape):
             lobes[rows][mask[rows], :, 4:] = 0.0
             release(lobes)
         total, signal = measured(), False
-    metrics = FitMetrics(
-        log_mse=total.log_mse,
-        log_mse_zero=total.log_mse_zero,
-        log_mse_rel=total.log_mse_rel,
-        texels=len(total.error),
-        signal=signal,
-    )
     best, median, worst = (_preview(texels, lobes, per_texel, at) for at in choose_texels(per_texel))
-    return LobeMap(lobes, mask), metrics, FunctionPreview(best, median, worst, per_texel)
+    return LobeMap(lobes, mask), metrics_of(total, signal=signal), FunctionPreview(best, median, worst, per_texel)
 
 
-def _take_refined(refines: Sequence[RefineResult], lobes: npt.NDArray[np.float16], context: Context) -> None:
-    """Write the refined lobes of all blocks into the map, as stored; InternalError where a block is not whole."""
+def _take_refined(
+    refines: Sequence[RefineResult], function: Function, lobes: npt.NDArray[np.float16], context: Context
+) -> None:
+    """Write a function's refined lobes into the map, as stored; InternalError where a block is not whole."""
     for refine in refines:
-        place, found = read_lobes(context.blob(refine.lobes))
+        place, found = read_lobes(context.blob(refine.lobes), function)
         if len(found) != refine.texels:
             raise InternalError(f"block {refine.block.row},{refine.block.column} has {len(found)} texels")
         lobes[place] = as_stored(found)

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from typing import Final
 
 from kiln_workers.fit.solution import Solver
+from kiln_workers.fit.solvers.coherent import coherent
 from kiln_workers.fit.solvers.descent import adam, adam_aligned, adam_random
 from kiln_workers.fit.solvers.encoder import cnn
 from kiln_workers.fit.solvers.fixed_lobes import fixed, fixed_12, fixed_log
 from kiln_workers.fit.solvers.harmonics import sh
-from kiln_workers.fit.solvers.joint import coherent
 from kiln_workers.fit.solvers.mixture import em, em_aligned
 from kiln_workers.fit.solvers.reference import lbfgs
 

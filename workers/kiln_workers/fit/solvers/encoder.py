@@ -25,11 +25,10 @@ def cnn(
     function: Function = Function.LIGHT_FIELD,
     seed: int = 0,
     start: Weights | None = None,
-    is_start: bool = False,
 ) -> Solution:
     """Trained on the field alone, for `settings.steps`, from `start` or from random weights.
 
-    FitFailed where it does not clearly beat P = 0, unless a descent starts from it (`is_start`).
+    FitFailed where it does not clearly beat P = 0.
     """
     watch = Stopwatch(on_epoch)
     threads = torch.get_num_threads()
@@ -48,7 +47,6 @@ def cnn(
         exposure=field.exposure,
         on_epoch=listen,
         start=start,
-        is_start=is_start,
     )
     solved = _represent(field, Weights.from_bytes(outcome.weights), threads)
     return Solution(solved, -(-outcome.steps * asked.batch // len(field)), watch.seconds)

@@ -16,35 +16,30 @@ Below a texel's horizon there is no light to fit, but a rough surface seen from 
 reaches there, and lobes that nothing holds draw speckles. So just below it the light field is continued as its own
 mirror image in the tangent plane, with a small weight.
 
-The start is the network's output, which is coherent over the whole light map; so blocks that are solved apart from each
-other, with a margin of their neighbours' texels that is dropped afterwards, agree where they meet.
-docs/design/fit.md has the measurements behind every number here.
+What the descent starts from is found by `solvers.coherent`. docs/design/fit.md has the measurements behind every
+number here.
 """
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kiln_schemas.settings import FitSettings
 from kiln_workers.fit.field import TexelField, TracedBetween
 from kiln_workers.fit.fused import losses_and_gradient
 from kiln_workers.fit.lobes import constrain, start_axes
 from kiln_workers.fit.metrics import horizon_weights
 from kiln_workers.fit.network import pixel_centres, solid_angles
 from kiln_workers.fit.optimizer import one_cycle
-from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, nobody
-from kiln_workers.fit.solvers.encoder import SETTINGS, cnn
 from kiln_workers.fit.solvers.joint_steps import Moving, add_gathered, add_pull, mix, unmix
 from kiln_workers.fit.solvers.losses import NORMALISATION
 from kiln_workers.fit.solvers.pixels import Pixels, split, with_weight
 from kiln_workers.fit.solvers.starts import unconstrain
-from kiln_workers.fit.solvers.stopwatch import Stopwatch
 from kiln_workers.fit.source import Float32, Index
 from kiln_workers.fit.threads import single_threaded_pool
 from kiln_workers.sphere import octahedral
@@ -66,35 +61,21 @@ _STREAM: Final = 0x636F68
 _TEXELS: Final = 64
 _POINTS: Final = 256
 
+_Out = TypeVar("_Out")
+
+
+OnStep = Callable[[int, Tensor, float], None]
+
+
+def silent(step: int, raw: Tensor, loss: float) -> None:
+    """Nobody listens."""
+
 
 @dataclass(frozen=True)
 class CoherentOptions:
     steps: int = 600
     rate: float = RATE
     alignment: tuple[float, float] = ALIGNMENT
-
-
-def coherent(
-    field: TexelField,
-    lobes: int,
-    on_epoch: OnEpoch = nobody,
-    *,
-    settings: FitSettings = SETTINGS,
-    seed: int = 0,
-) -> Solution:
-    """The network after `settings.start_steps`, then `refine_steps` of the descent; epochs and seconds of both."""
-    start_settings = settings.model_copy(update={"steps": settings.start_steps})
-    trained = cnn(field, lobes, on_epoch, settings=start_settings, seed=seed, is_start=True)
-    watch = Stopwatch(on_epoch)
-    normals = torch.from_numpy(field.normals)
-
-    def tell(step: int, raw: Tensor) -> None:
-        watch.tell(trained.epochs + step, lambda: Lobes(constrain(raw, normals)))
-
-    options = CoherentOptions(steps=settings.refine_steps)
-    start = trained.representation.parameters
-    found = descend(field, start, options, seed, threads=torch.get_num_threads(), on_step=tell)
-    return Solution(Lobes(found), trained.epochs + options.steps, trained.seconds + watch.seconds)
 
 
 def descend(
@@ -104,9 +85,11 @@ def descend(
     seed: int,
     *,
     threads: int = 1,
-    on_step: Callable[[int, Tensor], None] = lambda step, raw: None,
+    on_step: OnStep = silent,
 ) -> Tensor:
-    """Lobes [T, N, 7] from exposure-normalised `start` [T, N, 7]; `on_step` gets the steps done and the parameters.
+    """Lobes [T, N, 7] from exposure-normalised `start` [T, N, 7], exposure-normalised too.
+
+    `on_step` gets the number of steps done, the parameters after them and the loss a texel that the last one began at.
 
     The same bytes on any number of threads: each chunk of texels is computed by one, with single-threaded kernels.
     """
@@ -116,7 +99,7 @@ def descend(
         descent = _Descent(field, start, options, seed, pool)
         for step in range(options.steps):
             descent.step(step)
-            on_step(step + 1, descent.raw)
+            on_step(step + 1, descent.raw, descent.loss)
     return constrain(descent.raw, torch.from_numpy(field.normals))
 
 
@@ -149,6 +132,8 @@ class _Descent:
         self, field: TexelField, start: Tensor, options: CoherentOptions, seed: int, pool: ThreadPoolExecutor
     ) -> None:
         self._options, self._seed, self._pool = options, seed, pool
+        self.loss = 0.0
+        """Of a texel, in the mean over all, at the lobes that the last gradient was taken at."""
         self._table = pixel_centres(field.image_size)
         normals = torch.from_numpy(field.normals)
         raw = unconstrain(start, normals).contiguous()
@@ -195,40 +180,40 @@ class _Descent:
         points = [part.turn(rng) for part in self._points]
         out = np.empty_like(self._moving.lobes)
 
-        def learn(part: _Part, pixels: Pixels) -> None:
-            gradient = self._by_loss(self._moving.lobes[part.where], pixels)
+        def learn(part: _Part, pixels: Pixels) -> float:
+            losses, gradient = self._by_loss(self._moving.lobes[part.where], pixels)
             add_gathered(
                 gradient, self._by_points, self._starts[part.where.start : part.where.stop + 1], self._points_of
             )
             add_pull(gradient, self._moving.lobes, self._beside[part.where], np.float32(alignment))
             out[part.where] = gradient
+            return float(losses.sum(dtype=np.float64))
 
         self._each(lambda part: self._moving.constrain(part.where), self._texels)
         self._each(self._learn_between, self._points, points)
-        self._each(learn, self._texels, texels)
+        self.loss = sum(self._each(learn, self._texels, texels)) / len(out)
         return out
 
-    def _each(self, work: Callable[..., None], *parts: Sequence[Any]) -> None:
-        for _ in self._pool.map(work, *parts):
-            pass
+    def _each(self, work: Callable[..., _Out], *parts: Sequence[Any]) -> list[_Out]:
+        return list(self._pool.map(work, *parts))
 
     def _learn_between(self, part: _Part, pixels: Pixels) -> None:
         """Write the gradient of some between points by the lobes of each of their corners."""
         lobes, corners = self._moving.lobes, self._corners[part.where]
         mixed = np.empty((len(corners), *lobes.shape[1:]), np.float32)
         mix(lobes, corners, mixed)
-        gradient = self._by_loss(mixed, pixels)
+        _, gradient = self._by_loss(mixed, pixels)
         unmix(lobes, corners, gradient)
         self._by_points[part.where] = gradient
 
-    def _by_loss(self, lobes: Float32, pixels: Pixels) -> Float32:
-        """The gradient [M, N, 7] of the log loss by lobes [M, N, 7]."""
-        _, gradient = losses_and_gradient(
+    def _by_loss(self, lobes: Float32, pixels: Pixels) -> tuple[Float32, Float32]:
+        """The log loss [M] and its gradient [M, N, 7] by lobes [M, N, 7]."""
+        losses, gradient = losses_and_gradient(
             torch.from_numpy(lobes),
             *(pixels.log_targets, self._table, pixels.index, pixels.weights),
             1.0 / NORMALISATION,
         )
-        return gradient.numpy()
+        return losses.numpy(), gradient.numpy()
 
 
 def mean_targets(field: TexelField) -> TracedBetween:
