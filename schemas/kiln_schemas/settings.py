@@ -209,7 +209,7 @@ PRESETS: Final[Mapping[str, BakeSettings]] = {
     "draft": BakeSettings(
         preset="draft",
         lightmap=LightmapSettings(density=1.4, least=32, most=128, irradiance_scale=4, tile=8),
-        render=RenderSettings(image_size=32, samples=32, irradiance_samples=512),
+        render=RenderSettings(image_size=32, samples=32, between_samples=16, irradiance_samples=512),
         fit=FitSettings(lobes=8, steps=1000, visibility_steps=250),
         package=PackageSettings(environment_size=64),
     ),
