@@ -189,6 +189,9 @@ class PackageSettings(Contract):
         description="side of the GGX cube's largest mip",
     )
     supercompress: bool = Field(default=True, description="Zstandard inside the lobe textures")
+    denoise: bool = Field(
+        default=False, description="take noise out of the irradiance: mean error as of two to four times the paths"
+    )
     pictures: bool = Field(
         default=True, description="compare a picture of the package with a path-traced one where no gate does"
     )

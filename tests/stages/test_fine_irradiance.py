@@ -8,9 +8,11 @@ import OpenEXR
 import pytest
 import torch
 from e2e_farm import TINY, room, sky
-from in_process import Baked, bake
+from in_process import Baked, MemoryContext, bake
 
 from kiln_schemas.settings import LARGEST_SIDE, LightmapSettings, make_settings
+from kiln_schemas.tasks import PackagePayload
+from kiln_workers.package.denoise import denoise
 from kiln_workers.package.dilate import plan_fill
 from kiln_workers.render.tile import INSIDE_GEOMETRY, TexelBatch, TileRenderer
 from kiln_workers.scene.atlas import make_lightmap
@@ -18,7 +20,7 @@ from kiln_workers.scene.model import Environment, Material, Mesh, Scene
 from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
 from kiln_workers.scene.texels import build_texel_map
 from kiln_workers.shade import textures
-from kiln_workers.stages import prepare
+from kiln_workers.stages import package, prepare
 from kiln_workers.stages.tiles import covered_texels, map_coordinates, without_texels
 from kiln_workers.store.light_field import LightFieldStore
 
@@ -59,18 +61,46 @@ def test_every_finer_texel_is_in_one_tile(baked: Baked) -> None:
     np.testing.assert_array_equal(count, finer_map.state != TexelState.GUTTER)
 
 
+def of_store(baked: Baked) -> tuple[TexelMap, np.ndarray]:
+    """The finer map's texels as rendering judged them, and its irradiance [H, W, 3] as the store holds it."""
+    texels = unpack_texel_map(baked.context.blob(baked.prepared.fine or ""))
+    finer = LightFieldStore.open(baked.prepare_payload.store_url).read_fine_irradiance(baked.prepared.tiles)
+    return without_texels(texels, (finer == INSIDE_GEOMETRY).all(axis=2)), np.maximum(finer, 0.0)
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    with OpenEXR.File(str(path)) as file:
+        return np.array(file.channels()["RGB"].pixels, np.float32)
+
+
 def test_the_package_has_the_finer_map(baked: Baked, tmp_path: Path) -> None:
-    folder = baked.download(tmp_path)
-    with OpenEXR.File(str(folder / "irradiance.exr")) as file:
-        stored = np.array(file.channels()["RGB"].pixels, np.float32)
-    store = LightFieldStore.open(baked.prepare_payload.store_url)
-    finer = store.read_fine_irradiance(baked.prepared.tiles)
+    stored = read_rgb(baked.download(tmp_path) / "irradiance.exr")
+    texels, finer = of_store(baked)
+    valid = texels.state == TexelState.VALID
     assert stored.shape == finer.shape
-    valid = (unpack_texel_map(baked.context.blob(baked.prepared.fine or "")).state == TexelState.VALID) & (
-        finer != INSIDE_GEOMETRY
-    ).all(axis=2)
     np.testing.assert_allclose(stored[valid], finer[valid], rtol=1e-5)
     assert (stored >= 0.0).all()
+
+
+def test_the_package_takes_the_noise_out_where_it_is_asked_to(baked: Baked, tmp_path: Path) -> None:
+    asked = baked.prepare_payload
+    settings = asked.settings.model_copy(
+        update={"package": asked.settings.package.model_copy(update={"denoise": True})}
+    )
+    context = MemoryContext(scratch=tmp_path, blobs=dict(baked.context.blobs))
+    payload = PackagePayload(
+        **{"job_id": "0" * 32, "job_name": "room", "bundle": asked.bundle, "store_url": asked.store_url},
+        **{"prepare": baked.prepared, "renders": baked.renders, "fits": baked.fits, "refines": baked.refines},
+        settings=settings,
+    )
+    package.run(payload, context)
+    stored = read_rgb(tmp_path / "package" / "irradiance.exr")
+    texels, finer = of_store(baked)
+    valid = texels.state == TexelState.VALID
+    expected = finer.copy()
+    denoise(expected, texels)
+    assert np.mean(np.abs(expected - finer)[valid]) > 0.005 * finer[valid].mean()
+    np.testing.assert_allclose(stored[valid], expected[valid], rtol=1e-5)
 
 
 def test_a_light_map_of_scale_one_has_none(baked: Baked, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from kiln_workers.fit.predict import Weights, predict
 from kiln_workers.fit.source import VALID, valid_texels
 from kiln_workers.fit.verdict import failure, has_failed, is_negligible
 from kiln_workers.package.build import EnvironmentTextures, LobeMap, PackageInput, build_package
+from kiln_workers.package.denoise import denoise
 from kiln_workers.package.half import as_stored
 from kiln_workers.package.original import encode_original
 from kiln_workers.package.preview import FunctionPreview, PackagePreview, TexelPreview, choose_texels
@@ -64,6 +65,8 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
 
     steps = len(payload.fits) + 2
     irradiance_map, irradiance = _irradiance(payload, store, texel_map, tiles, context)
+    if payload.settings.package.denoise:
+        denoise(irradiance, irradiance_map)
     covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles}
     lobes: dict[Function, LobeMap] = {}
     metrics: dict[Function, FitMetrics] = {}
