@@ -40,7 +40,7 @@ from kiln_workers.package.gates import Judgement, write_gates
 from kiln_workers.package.glb import encode_glb
 from kiln_workers.package.half import lobes_to_layers, to_half
 from kiln_workers.package.preview import PackagePreview
-from kiln_workers.package.seams import Stitcher
+from kiln_workers.package.seams import LOBES, Stitcher
 from kiln_workers.scene.bands import bands, release
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.texel_map import speck_share
@@ -179,7 +179,7 @@ def build_package(folder: Path, given: PackageInput, judge: Judge | None = None)
     valid = given.irradiance_map.state == TEXEL_VALID
     for function, lobe_map in given.lobes.items():
         fill = plan_fill(lobe_map.mask, given.texel_map.chart)
-        _write_lobes(package, function, lobe_map, fill, Stitcher(given.scene, fill))
+        _write_lobes(package, function, lobe_map, fill, Stitcher(given.scene, fill, LOBES))
     fill = plan_fill(valid, given.irradiance_map.chart)
     irradiance = _filled_irradiance(given.irradiance, fill, Stitcher(given.scene, fill))
     _write_irradiance(package, irradiance)
@@ -240,14 +240,13 @@ def _write_lobes(package: _Package, function: Function, lobe_map: LobeMap, fill:
             source = tuple(grid.ravel()[place] for grid in fill.sources(rows))
             near_seams[part] = lobe_map.lobes[source]
             release(lobe_map.lobes)
-    closed = stitcher.solved(near_seams.reshape(-1, count * parameters)).reshape(near_seams.shape)
+    closed = stitcher.solved_lobes(near_seams)
 
     def layers() -> Iterator[tuple[int, npt.NDArray[np.float16]]]:
         for rows in bands(lobe_map.mask.shape, LOBE_SHARE):
             lobes = fill.nearest(lobe_map.lobes, rows).astype(np.float32)
             part, place = stitcher.within(rows, width)
             lobes.reshape(-1, count, parameters)[place] = closed[part]
-            lobes[..., 3:] = np.maximum(lobes[..., 3:], 0.0)  # an extrapolated sharpness or amplitude
             texels, clamped = lobes_to_layers(lobes)
             package.clamped += clamped
             yield rows.start, texels

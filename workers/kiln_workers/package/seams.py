@@ -9,11 +9,17 @@ seams as little as needed:
              + sum over texels i of r_i (x_i - y_i)^2
 
 where y are the values before, a_s and b_s are the bilinear weights of the seam point on its two sides, and r_i is
-ANCHOR for a texel with data and FILLED for a filled one. So it is mostly the filled texels that change: they come to
-continue the surface beyond the cut. The problem is linear in the values, so one factorisation serves irradiance and
-every channel of the lobes. docs/results/seams.md has the figures.
+larger for a texel with data than for a filled one (IRRADIANCE). So it is mostly the filled texels that change: they
+come to continue the surface beyond the cut. The problem is linear in the values, so one factorisation serves all
+channels.
+
+Lobes are not continued: a line through two sharpnesses soon leaves what a lobe can be, and lobes that the descent has
+made sharp came out far worse than they were. Their sharpness and amplitudes are solved for as logarithms, as in the
+fit, and their weights (LOBES) hold filled texels too.
+docs/results/seams.md has the figures.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -34,10 +40,12 @@ SMOOTH: Final = 0.95
 """Cosine of the two sides' shading normals from which on an edge is a cut through a smooth surface, not a crease."""
 POINTS_A_TEXEL: Final = 2
 """Seam points along one texel of the longer side of a cut edge."""
-ANCHOR: Final = 1.0
-"""Weight that keeps a texel with data as it is,"""
-FILLED: Final = 0.01
-"""and one that the filling has made up."""
+IRRADIANCE: Final = (1.0, 0.01)
+"""Weights that keep a texel with data as it is, and one that the filling has made up,"""
+LOBES: Final = (10.0, 1.0)
+"""and those for lobes."""
+FAINTEST: Final = 2.0**-24
+"""The smallest number above 0 that a texture can hold; a lobe without light stays without."""
 MOST_SIDES: Final = 8
 """Triangle sides of one edge that are paired; a surface has two."""
 
@@ -85,7 +93,7 @@ def bilinear(points: Float64, height: int, width: int) -> tuple[Int64, Float64]:
 class Stitcher:
     """Solves for the seams of one light map; the factorisation is shared by all of its channels."""
 
-    def __init__(self, scene: Scene, fill: Fill) -> None:
+    def __init__(self, scene: Scene, fill: Fill, weights: tuple[float, float] = IRRADIANCE) -> None:
         """`fill` says which texels [H, W] have data of their own; `texels` are those near seams, row * W + column."""
         height, width = fill.valid.shape
         self.points = seam_points(scene, max(height, width))
@@ -97,7 +105,7 @@ class Stitcher:
         entries = np.concatenate([sides[0][1], -sides[1][1]], axis=1)
         places = (np.repeat(np.arange(len(entries)), 8), unknown.ravel())
         self._jump = csc_array(coo_array((entries.ravel(), places), shape=(len(entries), count)))
-        anchor = np.where(fill.valid.ravel()[self.texels], ANCHOR, FILLED)
+        anchor = np.where(fill.valid.ravel()[self.texels], *weights)
         self._factors = splu(csc_array(self._jump.T @ self._jump + diags_array(anchor)))
 
     def stitch(self, values: Float32) -> Float32:
@@ -108,13 +116,21 @@ class Stitcher:
         flat[self.texels] = self.solved(flat[self.texels])
         return flat.reshape(values.shape)
 
-    def solved(self, values: Float32) -> Float64:
+    def solved(self, values: Float32 | Float64) -> Float64:
         """The closed seams' values [M, C] at `texels`, from those before."""
         before = values.astype(np.float64)
         if not len(before):
             return before
         # The change d = x - y solves (J'J + diag r) d = -J'J y.
         return np.asarray(before + self._factors.solve(-(self._jump.T @ (self._jump @ before))))
+
+    def solved_lobes(self, lobes: Float32) -> Float64:
+        """The same of lobes [M, N, 7]; their axes are not of unit length."""
+        values = lobes.astype(np.float64)
+        values[..., 3:] = np.log(values[..., 3:] + FAINTEST)
+        closed = self.solved(values.reshape(len(values), math.prod(values.shape[1:]))).reshape(values.shape)
+        closed[..., 3:] = np.maximum(np.exp(closed[..., 3:]) - FAINTEST, 0.0)
+        return closed
 
     def within(self, rows: slice, width: int) -> tuple[slice, Int64]:
         """Which of `texels` lie in some rows, and their numbers from the first of these rows on."""
