@@ -140,7 +140,7 @@ class FitSettings(Contract):
     lobes: int = Field(ge=1, le=64, description="spherical Gaussians per texel")
     steps: int = Field(ge=1, le=1_000_000, description="optimiser steps of the light field's network (solver cnn)")
     start_steps: int = Field(
-        default=400, ge=1, le=1_000_000, description="steps of the coherent descent on few texels of the light map"
+        default=600, ge=1, le=1_000_000, description="steps of the coherent descent on few texels of the light map"
     )
     visibility_steps: int = Field(
         default=1000, ge=1, le=1_000_000, description="optimiser steps of the visibility's network (solver cnn)"

@@ -26,19 +26,19 @@ def start_on(place: np.ndarray, chart: np.ndarray, *, signal: bool = True) -> St
     return Start(place, chart, lobes, 0.5, signal)
 
 
-def test_one_texel_in_three_each_way_and_one_of_each_chart() -> None:
+def test_one_texel_in_two_each_way_and_one_of_each_chart() -> None:
     """A square of 9 x 9 texels, and two charts that no texel of the grid lies in."""
     square = np.argwhere(np.ones((9, 9), bool))
-    place = np.concatenate([square, [[1, 20], [1, 21], [40, 40]]])
+    place = np.concatenate([square, [[1, 21], [1, 23], [41, 40]]])
     chart = np.array([5] * 81 + [2, 2, 9])
     chosen = place[chosen_texels(place, chart)].tolist()
-    assert chosen == [[r, c] for r in (0, 3, 6) for c in (0, 3, 6)] + [[1, 20], [40, 40]]
+    assert chosen == [[r, c] for r in range(0, 9, 2) for c in range(0, 9, 2)] + [[1, 21], [41, 40]]
 
 
 @pytest.mark.parametrize("side", [100, 500, 2000])
 def test_the_start_of_a_large_light_map_is_bounded(side: int) -> None:
     step = stride(side * side)
-    assert step >= 3 and (side // step) ** 2 <= MOST_TEXELS
+    assert step >= 2 and (side // step) ** 2 <= MOST_TEXELS
 
 
 def test_each_texel_takes_the_lobes_of_the_nearest_in_its_chart() -> None:

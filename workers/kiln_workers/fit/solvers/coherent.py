@@ -32,9 +32,9 @@ from kiln_workers.fit.solvers.stopwatch import Stopwatch
 from kiln_workers.fit.source import Float32, Index
 from kiln_workers.scene.container import pack, unpack
 
-STRIDE: Final = 3
+STRIDE: Final = 2
 """Texels each way from one texel of the start to the next, at least."""
-MOST_TEXELS: Final = 8192
+MOST_TEXELS: Final = 16384
 """Texels of the start beside those that stand for a small chart, about: it is held in memory as a whole."""
 
 _KIND: Final = "fit-start"
