@@ -118,3 +118,29 @@ def test_a_room_turned_inside_out_is_told_of(kind: str, quad: Quad) -> None:
     (note,) = notes(inward=False)
     assert "Nothing in the scene is lit" in note and "backs of one-sided faces" in note and "double-sided" in note
     assert notes(inward=True) == () and notes(inward=False, material=2) == ()
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_bent_sheet_of_two_faces_stays_in_one_piece(shared: bool) -> None:
+    """A quarter of a pipe and its copy on the back in one mesh: each moves out of the other and none of it comes apart.
+
+    With a vertex for each corner of a face, as after flat shading, and with vertices that both sides share.
+    """
+    columns, rows = 8, 5
+    angle = np.linspace(0.0, np.pi / 2.0, columns)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(columns)], axis=1)
+    points = (ring[None] + np.arange(rows)[:, None, None] * np.array([0.0, 0.0, 0.3])).reshape(-1, 3)
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
+    right, up = corner + 1, corner + columns
+    outer = np.concatenate([np.stack([corner, right, up + 1], 1), np.stack([corner, up + 1, up], 1)])
+    faces = np.concatenate([outer, outer[:, ::-1]])
+    if not shared:
+        points, faces = points[faces.reshape(-1)], np.arange(faces.size).reshape(-1, 3)
+    normals = np.tile(np.float32([1.0, 0.0, 0.0]), (len(points), 1))
+    sheet = Mesh("pipe", points.astype(np.float32), normals, faces.astype(np.int32), 0)
+    (moved,) = part_sheets(Scene((sheet,), MATERIALS), "cpu").meshes
+    assert len(moved.faces) == len(faces)
+    places = [moved.positions[part].reshape(-1, 3) for part in np.split(moved.faces, 2)]
+    assert [len(np.unique(place, axis=0)) for place in places] == [columns * rows] * 2
+    outside, inside = (np.linalg.norm(place[:, :2], axis=1) for place in places)
+    assert outside.min() > 1.0 > inside.max() and outside.max() - inside.min() < 1e-4

@@ -13,8 +13,11 @@ from scipy.sparse.csgraph import connected_components
 from kiln_workers.scene.geometry import Floats, Ints, face_normals
 
 
-def surface_corners(positions: Floats, faces: Ints) -> Ints:
-    """Number of the surface vertex [F, 3] at each corner, 0 ... n-1, for positions [V, 3] and faces [F, 3]."""
+def surface_corners(positions: Floats, faces: Ints, least: float = -2.0) -> Ints:
+    """Number of the surface vertex [F, 3] at each corner, 0 ... n-1, for positions [V, 3] and faces [F, 3].
+
+    Faces whose normals have a smaller cosine than `least` do not continue each other.
+    """
     welded = np.unique(positions + 0.0, axis=0, return_inverse=True)[1].reshape(-1)[faces]
     start, end = welded.reshape(-1), welded[:, [1, 2, 0]].reshape(-1)
     low, high = np.minimum(start, end), np.maximum(start, end)
@@ -33,6 +36,7 @@ def surface_corners(positions: Floats, faces: Ints) -> Ints:
         for pair in _best_pairs(order[begin : begin + number], start, normals)
     ]
     joined = np.concatenate([pairs, np.array(more, dtype=np.int64).reshape(-1, 2)])
+    joined = joined[np.einsum("pc,pc->p", normals[joined[:, 0] // 3], normals[joined[:, 1] // 3]) >= least]
     # Half-edge h runs from corner h to the next corner of its face; its partner runs the other way.
     following = np.arange(len(start)).reshape(-1, 3)[:, [1, 2, 0]].reshape(-1)
     a, b = joined[:, 0], joined[:, 1]

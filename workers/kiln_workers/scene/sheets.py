@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from kiln_workers.render.backend import Device
 from kiln_workers.scene.geometry import Floats, Ints, face_normals
+from kiln_workers.scene.manifold import surface_corners
 from kiln_workers.scene.model import Mesh, Scene
 from kiln_workers.scene.precision import face_clearance
 from kiln_workers.scene.push_out import BareTriangles
@@ -29,6 +30,9 @@ SAME_PLACE: Final = 2.0
 
 GAP: Final = 3.0
 """Clearances by which each of them is moved."""
+
+FOLD: Final = -0.9
+"""Cosine between the normals of two faces below which they are two sheets that end at the same edge."""
 
 SPLIT: Final = np.array([0.8326, 0.4507, 0.3222])
 """Faces are told apart by the side of this direction that they face, so that no common wall lies across it."""
@@ -88,17 +92,24 @@ def _mark(scene: Scene, faces: _Faces, asking: Ints, others: Bools, moved: Bools
 
 
 def _moved(mesh: Mesh, moved: Bools, normal: Floats, gap: Floats) -> Mesh:
-    """The mesh with the vertices of its faces `moved` [F] moved so far that each of these faces moves by its gap."""
+    """The mesh with its surface's vertices at the faces `moved` [F] moved so far that each of these moves by its gap.
+
+    A vertex of the surface moves as one, however many vertices of the mesh it is, so that no faces come apart. Where
+    the two sheets share a vertex of the mesh it becomes two.
+    """
     if not moved.any():
         return mesh
-    corners, mine = mesh.faces[moved], normal[moved]
-    mean, most = np.zeros((len(mesh.positions), 3)), np.zeros(len(mesh.positions))
+    surface = surface_corners(mesh.positions.astype(np.float64), mesh.faces.astype(np.int64), FOLD)
+    corners, mine = surface[moved], normal[moved]
+    mean, most = np.zeros((int(surface.max()) + 1, 3)), np.zeros(int(surface.max()) + 1)
     for k in range(3):
         np.add.at(mean, corners[:, k], mine)
         np.maximum.at(most, corners[:, k], gap[moved])
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-30)
-    least = np.ones(len(mesh.positions))
+    least = np.ones(len(mean))
     for k in range(3):
         np.minimum.at(least, corners[:, k], np.einsum("fc,fc->f", mean[corners[:, k]], mine))
     shift = (most / np.maximum(least, 0.2))[:, None] * mean
-    return replace(mesh, positions=(mesh.positions + shift).astype(np.float32))
+    vertices, number = np.unique(np.stack([mesh.faces, surface], axis=2).reshape(-1, 2), axis=0, return_inverse=True)
+    parted = mesh.with_vertices(vertices[:, 0], number.reshape(-1, 3).astype(np.int32))
+    return replace(parted, positions=(parted.positions + shift[vertices[:, 1]]).astype(np.float32))
