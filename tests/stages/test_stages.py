@@ -21,6 +21,7 @@ from kiln_schemas.manifest import Manifest
 from kiln_schemas.settings import Function, make_settings
 from kiln_schemas.tasks import (
     Bundle,
+    FitPayload,
     PackagePayload,
     RefineResult,
 )
@@ -43,6 +44,7 @@ from kiln_workers.shade.image_metrics import flip
 from kiln_workers.shade.package import ShadePackage, read_manifest
 from kiln_workers.shade.picture import shade
 from kiln_workers.shade.reference import path_trace
+from kiln_workers.stages import fit as fit_stage
 from kiln_workers.stages import gates, package, prepare, refine, render
 from kiln_workers.stages.tiles import covered_texels, map_coordinates, plan_tiles, with_render_verdict
 from kiln_workers.store.layout import BETWEEN_STEPS
@@ -338,3 +340,17 @@ def test_without_a_gate_one_picture_is_compared(baked: Baked, downloaded: Path, 
     assert [(view.camera, view.seen.camera) for view in named] == [("front", FRONT)]
     off = judged(downloaded, "package.pictures=off")
     assert off.views == () and off.not_compared == "package.pictures is off"
+
+
+def test_a_light_map_without_a_valid_texel_is_told_of(baked: Baked, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_stage, "valid_texels", lambda state, tile: np.zeros(0, np.int64))
+    monkeypatch.setattr("kiln_workers.fit.source.valid_texels", lambda state, tile: np.zeros(0, np.int64))
+    payload = FitPayload(
+        function=Function.LIGHT_FIELD,
+        texel_map=baked.prepared.texel_map,
+        renders=baked.renders,
+        settings=baked.prepare_payload.settings,
+        store_url=baked.prepare_payload.store_url,
+    )
+    with pytest.raises(InputError, match="no texel of the light map is valid"):
+        fit_stage.run(payload, baked.context)

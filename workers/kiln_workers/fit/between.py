@@ -8,6 +8,7 @@ import numpy as np
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.fit.field import TexelField, TracedBetween
+from kiln_workers.fit.pooling import pooled
 from kiln_workers.fit.source import Index
 from kiln_workers.scene.texel_map import TexelMap, TexelState
 from kiln_workers.store.layout import BETWEEN_STEPS, sparse_offsets
@@ -33,14 +34,15 @@ def read_texels(
     texel_map: TexelMap,
     tiles: Sequence[tuple[Tile, Index]],
     exposure: float,
+    size: int | None = None,
 ) -> TexelField:
-    """The images of a function at the texels alone."""
-    size = store.image_size
+    """The images of a function at the texels alone, pooled to `size` as they are read."""
+    size = size or store.image_size
     images, places = [np.empty((0, size, size, 3), np.float16)], [np.empty((0, 2), np.int64)]
     for tile, inside in tiles:
         rows, columns = np.divmod(inside, tile.size)
         places.append(np.stack([rows + tile.row, columns + tile.column], axis=1))
-        images.append(store.read_tile(function, tile, inside))
+        images.append(pooled(store.read_tile(function, tile, inside), size))
     place = np.concatenate(places)
     at = place[:, 0], place[:, 1]
     chart = texel_map.chart[at].astype(np.int64)

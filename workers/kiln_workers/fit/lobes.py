@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kiln_schemas.conventions import LOBE_PARAMETERS
+from kiln_schemas.conventions import FP16_MAX, LOBE_PARAMETERS
 
 LOG_SHARPNESS: Final = (math.log(0.25), math.log(3000.0))
 """Range of log lambda: from nearly constant to one pixel of a 128 x 128 image; well inside fp16."""
@@ -67,6 +67,12 @@ def fibonacci_axes(count: int) -> Tensor:
 def amplitude_scale(factor: float) -> Tensor:
     """[7] by which lobes are multiplied so that their radiance is `factor` times as much."""
     return torch.tensor([1.0] * (LOBE_PARAMETERS - 3) + [factor] * 3)
+
+
+def in_scene_units(lobes: Tensor, exposure: float, signal: bool) -> Tensor:
+    """Exposure-normalised lobes [T, N, 7] as the store has radiance, amplitudes within fp16; dark without a signal."""
+    scale = 1.0 / exposure if signal else 0.0
+    return torch.cat([lobes[..., :4], (lobes[..., 4:] * scale).clamp(max=FP16_MAX)], dim=-1)
 
 
 def constrain(raw: Tensor, normals: Tensor) -> Tensor:

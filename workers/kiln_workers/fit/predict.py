@@ -11,10 +11,10 @@ from typing import Any, Final, Self
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from kiln_schemas.conventions import FORMAT_VERSION, FP16_MAX
+from kiln_schemas.conventions import FORMAT_VERSION
 from kiln_schemas.errors import InputError
+from kiln_workers.fit.lobes import in_scene_units
 from kiln_workers.fit.network import Shape, lobes, split
 from kiln_workers.fit.pooling import pooled
 from kiln_workers.fit.source import Float16, Float32
@@ -73,15 +73,10 @@ def predict(weights: bytes | Weights, images: Float16, normals: Float32, *, thre
         picture = torch.from_numpy(pooled(images[texel : texel + 1], network.shape.image_size))
         normal = torch.from_numpy(normals[texel : texel + 1].astype(np.float32))
         with torch.inference_mode():
-            out[texel] = _in_scene_units(lobes(layers, picture, normal, network.exposure), network).numpy()[0]
+            found = lobes(layers, picture, normal, network.exposure)
+            out[texel] = in_scene_units(found, network.exposure, network.signal).numpy()[0]
 
     with single_threaded_pool(threads) as pool:
         for _ in pool.map(one, range(len(images))):
             pass
     return out
-
-
-def _in_scene_units(normalised: Tensor, network: Weights) -> Tensor:
-    scale = 1.0 / network.exposure if network.signal else 0.0
-    amplitude = (normalised[..., 4:] * scale).clamp(max=FP16_MAX)
-    return torch.cat([normalised[..., :4], amplitude], dim=-1)

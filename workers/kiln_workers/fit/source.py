@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from kiln_schemas.errors import InputError
 from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Tile
 from kiln_workers.store.light_field import LightFieldStore
@@ -80,6 +81,16 @@ class StoreSource:
     def images(self, tile: int, texels: Index) -> Float16:
         place, inside = self._tiles[tile]
         return self._store.read_tile(self._function, place, inside[texels])
+
+
+def require_texels(source: TexelSource, function: Function) -> None:
+    """InputError where a source has no texel at all."""
+    if not sum(source.counts):
+        raise InputError(
+            f"no texel of the light map is valid, so there is nothing to fit the {function.value} to",
+            where="texel map",
+            remedy="Check the scene: every texel lies inside other geometry.",
+        )
 
 
 def valid_texels(state: npt.NDArray[Any], tile: Tile) -> Index:

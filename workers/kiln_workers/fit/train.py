@@ -28,7 +28,7 @@ from kiln_workers.fit.metrics import TexelErrors, exposure_of, has_signal, metri
 from kiln_workers.fit.network import INPUT_GAIN, Shape, encode, initial_parameters, network_input, split
 from kiln_workers.fit.optimizer import Adam, one_cycle
 from kiln_workers.fit.predict import Weights, predict
-from kiln_workers.fit.source import Float16, Float32, TexelSource
+from kiln_workers.fit.source import Float16, Float32, TexelSource, require_texels
 from kiln_workers.fit.stream import Batch, TexelStream
 from kiln_workers.fit.threads import single_threaded_pool
 from kiln_workers.fit.verdict import failure, has_failed
@@ -93,12 +93,7 @@ def train(
     `start` is a network of the same shape to go on from, instead of random weights.
     """
     began = time.monotonic()
-    if not sum(source.counts):
-        raise InputError(
-            f"no texel of the light map is valid, so there is nothing to fit the {function.value} to",
-            where="texel map",
-            remedy="Check the scene: every texel lies inside other geometry.",
-        )
+    require_texels(source, function)
     shape = Shape(source.image_size, settings.lobes)
     identity = {
         "function": function.value,

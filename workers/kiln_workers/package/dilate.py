@@ -3,7 +3,7 @@
 A bilinear lookup near a chart's border reads texels outside it, so these must continue the chart. Each texel without
 data takes its values from one source texel: a covered one from the nearest valid texel of its own chart, any other
 from the nearest covered one (`nearest`). Lobes are copied whole, because the k-th lobes of two texels correspond only
-as far as the network made them: an average over several charts would put lobes where neither had any. Irradiance is a
+as far as the fit made them: an average over several charts would put lobes where neither had any. Irradiance is a
 plain colour: beyond the rings that a filter can reach it is smoothed by Jacobi steps of Laplace's equation, so that mip
 maps and compressors see no cell borders. Valid texels are never changed.
 """

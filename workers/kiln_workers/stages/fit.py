@@ -11,25 +11,24 @@ from kiln_schemas.settings import Function, Solver
 from kiln_schemas.tasks import FitPayload, FitResult, Progress, Tile
 from kiln_workers.fit.between import read_texels
 from kiln_workers.fit.curve import Curve
-from kiln_workers.fit.metrics import exposure_of, has_signal, metrics_of, texel_errors
-from kiln_workers.fit.pooling import PooledSource
+from kiln_workers.fit.metrics import TexelErrors, exposure_of, has_signal, metrics_of, texel_errors
+from kiln_workers.fit.pooling import PooledSource, pooled_size
 from kiln_workers.fit.solvers.coherent import chosen_texels, find_start, stride
 from kiln_workers.fit.solvers.joint import CoherentOptions
-from kiln_workers.fit.source import Index, StoreSource, TexelSource, valid_texels
+from kiln_workers.fit.source import Index, StoreSource, TexelSource, require_texels, valid_texels
 from kiln_workers.fit.train import train
 from kiln_workers.fit.verdict import is_negligible
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
-from kiln_workers.stages.tiles import map_coordinates, with_render_verdict
+from kiln_workers.stages.tiles import map_coordinates, tiles_of, with_render_verdict
 from kiln_workers.store.light_field import LightFieldStore
 
 
 def run(payload: FitPayload, context: Context) -> FitResult:
     """The function's lobes as far as a fit of the whole light map at once makes them."""
     texel_map = with_render_verdict(unpack_texel_map(context.blob(payload.texel_map)), payload.renders)
-    tiles = sorted((render.tile for render in payload.renders), key=lambda tile: (tile.row, tile.column))
     store = LightFieldStore.open(payload.store_url)
-    covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles}
+    covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles_of(payload.renders)}
     with store.all_lost([payload.function.value, ARRAY_IRRADIANCE], covered):
         if payload.settings.fit.solver is Solver.COHERENT:
             result = _start(payload, context, store, texel_map, covered)
@@ -96,9 +95,10 @@ def _start(
     began = time.perf_counter()
     settings = payload.settings.fit
     source = StoreSource(store, payload.function, texel_map.state, texel_map.normal, list(covered))
+    require_texels(source, payload.function)
     exposure = exposure_of(source, payload.function)
     chosen, step = _chosen(texel_map, covered)
-    field = read_texels(store, payload.function, texel_map, chosen, exposure)
+    field = read_texels(store, payload.function, texel_map, chosen, exposure, pooled_size(store.image_size))
     options, curve = CoherentOptions(steps=settings.start_steps), Curve()
 
     def on_step(done: int, _: torch.Tensor, loss: float) -> None:
@@ -115,12 +115,17 @@ def _start(
         threads=context.threads,
         on_step=on_step,
     )
-    errors = texel_errors(start.in_scene_units(start.lobes), field.images, field.normals, exposure)
+    lobes, parts, done = start.in_scene_units(start.lobes), [], 0
+    for tile, inside in chosen:  # against whole images, which are not held
+        part = slice(done, done + len(inside))
+        images = store.read_tile(payload.function, tile, inside)
+        parts.append(texel_errors(lobes[part], images, field.normals[part], exposure))
+        done = part.stop
     return FitResult(
         function=payload.function,
         weights=context.put_blob(start.to_bytes()),
         exposure=exposure,
-        metrics=metrics_of(errors, signal=start.signal),
+        metrics=metrics_of(TexelErrors.join(parts), signal=start.signal),
         curve=tuple(curve.points),
         steps=options.steps,
         seconds=time.perf_counter() - began,

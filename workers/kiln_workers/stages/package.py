@@ -36,7 +36,7 @@ from kiln_workers.sphere.octahedral import pixel_directions
 from kiln_workers.stages.bundle import lay_out
 from kiln_workers.stages.gates import GateJudge
 from kiln_workers.stages.refine import read_lobes
-from kiln_workers.stages.tiles import map_coordinates, with_render_verdict, without_texels
+from kiln_workers.stages.tiles import map_coordinates, tiles_of, with_render_verdict, without_texels
 from kiln_workers.store.layout import TEXEL_MAP_ARRAYS
 from kiln_workers.store.light_field import LightFieldStore
 
@@ -61,7 +61,7 @@ def run(payload: PackagePayload, context: Context) -> PackageResult:
     texel_map = with_render_verdict(open_texel_map(context.blob_path(payload.prepare.texel_map)), payload.renders)
     store = LightFieldStore.open(payload.store_url)
     store.write_texel_map({name: getattr(texel_map, name) for name in TEXEL_MAP_ARRAYS})
-    tiles = tuple(sorted((render.tile for render in payload.renders), key=lambda tile: (tile.row, tile.column)))
+    tiles = tuple(tiles_of(payload.renders))
 
     steps = len(payload.fits) + 2
     irradiance_map, irradiance = _irradiance(payload, store, texel_map, tiles, context)

@@ -7,7 +7,6 @@ that of one block's images; a lost task is simply done again, and gives the same
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -19,14 +18,14 @@ from kiln_schemas.settings import Function
 from kiln_schemas.tasks import Block, RefinePayload, RefineResult, Tile
 from kiln_workers.fit.between import read_field, read_texels
 from kiln_workers.fit.field import TexelField
-from kiln_workers.fit.pooling import pooled, pooled_size
+from kiln_workers.fit.pooling import pooled_size
 from kiln_workers.fit.solvers.coherent import Start
 from kiln_workers.fit.solvers.joint import CoherentOptions, descend
 from kiln_workers.fit.source import Index, valid_texels
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.container import pack, unpack
 from kiln_workers.scene.texel_map import TexelMap, unpack_texel_map
-from kiln_workers.stages.tiles import map_coordinates, with_render_verdict
+from kiln_workers.stages.tiles import map_coordinates, tiles_of, with_render_verdict
 from kiln_workers.store.light_field import LightFieldStore
 
 Float32 = npt.NDArray[np.float32]
@@ -41,8 +40,7 @@ def run(payload: RefinePayload, context: Context) -> RefineResult:
     settings = payload.settings.fit
     texel_map = with_render_verdict(unpack_texel_map(context.blob(payload.texel_map)), payload.renders)
     store = LightFieldStore.open(payload.store_url)
-    in_order = sorted((render.tile for render in payload.renders), key=lambda tile: (tile.row, tile.column))
-    tiles = list(_with_halo(texel_map, in_order, payload.block))
+    tiles = list(_with_halo(texel_map, tiles_of(payload.renders), payload.block))
     steps = [getattr(settings, settings.refine_steps_key(fit.function)) for fit in payload.fits]
     arrays: dict[str, npt.NDArray[np.generic]] = {}
     for number, fit in enumerate(payload.fits):
@@ -88,8 +86,7 @@ def _read(
     """A function's images at the tiles' texels; of the light field also those between, of the visibility small ones."""
     if function is Function.VISIBILITY:
         with store.all_lost([function.value], dict(tiles)):
-            field = read_texels(store, function, texel_map, tiles, exposure)
-        return replace(field, images=pooled(field.images, pooled_size(field.image_size)))
+            return read_texels(store, function, texel_map, tiles, exposure, pooled_size(store.image_size))
     between = [ARRAY_BETWEEN] if store.has_between else []
     with store.all_lost([function.value, *between], dict(tiles)):
         return read_field(store, texel_map, tiles, exposure, lambda: _moved(payload, context))

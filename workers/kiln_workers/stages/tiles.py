@@ -25,6 +25,11 @@ def plan_tiles(texel_map: TexelMap, size: int) -> tuple[Tile, ...]:
     return tuple(tiles)
 
 
+def tiles_of(renders: Iterable[RenderResult]) -> list[Tile]:
+    """The rendered tiles, row by row."""
+    return sorted((render.tile for render in renders), key=lambda tile: (tile.row, tile.column))
+
+
 def covered_texels(texel_map: TexelMap, tile: Tile, scale: int = 1) -> Ints:
     """Row-major indices inside the tile [T] of its texels with a surface point, ascending.
 

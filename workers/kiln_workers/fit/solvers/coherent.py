@@ -19,10 +19,10 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from kiln_schemas.conventions import FORMAT_VERSION, FP16_MAX
+from kiln_schemas.conventions import FORMAT_VERSION
 from kiln_schemas.settings import FitSettings
 from kiln_workers.fit.field import TexelField
-from kiln_workers.fit.lobes import amplitude_scale, constrain
+from kiln_workers.fit.lobes import constrain, in_scene_units
 from kiln_workers.fit.pooling import pooled, pooled_size
 from kiln_workers.fit.solution import Lobes, OnEpoch, Solution, nobody
 from kiln_workers.fit.solvers.encoder import SETTINGS
@@ -68,10 +68,7 @@ class Start:
 
     def in_scene_units(self, lobes: Float32) -> Float32:
         """Lobes [T, N, 7] as the store has radiance, amplitudes within fp16; dark ones where there is no signal."""
-        scale = amplitude_scale(1.0 / self.exposure if self.signal else 0.0).numpy()
-        out = lobes * scale
-        out[..., 4:] = np.minimum(out[..., 4:], FP16_MAX)
-        return np.asarray(out, np.float32)
+        return np.asarray(in_scene_units(torch.from_numpy(lobes), self.exposure, self.signal).numpy(), np.float32)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:

@@ -4,7 +4,7 @@ from typing import Final
 
 import torch
 
-from kiln_schemas.settings import PRESETS, FitSettings, Function, Solver
+from kiln_schemas.settings import PRESETS, FitSettings, Function
 from kiln_workers.fit.field import TexelField
 from kiln_workers.fit.lobes import amplitude_scale
 from kiln_workers.fit.predict import Weights, predict
@@ -32,7 +32,7 @@ def cnn(
     """
     watch = Stopwatch(on_epoch)
     threads = torch.get_num_threads()
-    asked = settings.model_copy(update={"lobes": lobes, "solver": Solver.CNN})
+    asked = settings.model_copy(update={"lobes": lobes})
     source = ArraySource(field.images, field.normals)
 
     def listen(epoch: int, weights: Weights) -> None:
