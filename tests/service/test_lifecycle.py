@@ -39,7 +39,8 @@ def test_a_job_runs_through_all_stages(home):
     payload = refine["payload"]
     assert worker.claim() is None, "the package waits for the last block"
     assert payload["block"] == {"row": 0, "column": 0, "size": 32} and len(payload["between"]) == 3
-    assert payload["fit"]["function"] == "light_field" and len(payload["renders"]) == 3
+    assert [fit["function"] for fit in payload["fits"]] == ["light_field", "visibility"]
+    assert len(payload["renders"]) == 3
     elsewhere = {"row": 32, "column": 0, "size": 32}
     wrong = {"kind": "refine", "block": elsewhere, "lobes": "0" * 64, "texels": 1, "steps": 1, "seconds": 1.0}
     refused = worker.commit(refine, wrong)
