@@ -1,5 +1,6 @@
 """Logs of tasks: bounded by attempt, by job and in all, and read by ranges."""
 
+import psycopg
 import pytest
 
 from kiln_service.config import Limits, LogLimits
@@ -108,3 +109,14 @@ def test_jobs_and_the_whole_farm_are_bounded_too(small, eventually):
     assert size(small, f"task_id IN (SELECT id FROM tasks WHERE job_id = '{last}')") > 0
     assert "bytes before this were dropped" in read_whole(small, first[1])
     assert "piece 17" in read_whole(small, newest)
+
+
+def test_a_heartbeat_that_logs_waits_for_nobody_who_holds_the_job(home):
+    """Commits and claims lock the job, then its tasks; a heartbeat has its task and must not ask for the job."""
+    job = home.submit()
+    worker = home.worker()
+    claim = worker.must_claim()
+    with psycopg.connect(home.config.database or "") as holder:
+        holder.execute("SELECT 1 FROM jobs WHERE id = %s FOR UPDATE", (job["id"],))
+        worker.beat(claim, log="a line\n")
+    assert size(home) == len("a line\n")

@@ -68,7 +68,9 @@ def free_ports(count: int) -> list[int]:
     """Ports that are free, and GRPC_OFFSET above them too."""
     ports: list[int] = []
     while len(ports) < count:
-        port = random.randrange(20_000, 50_000)
+        port = random.randrange(20_000, 20_000 + GRPC_OFFSET)  # so that none is the gRPC port of another
+        if port in ports:
+            continue
         with socket.socket() as low, socket.socket() as high:
             try:
                 low.bind(("127.0.0.1", port))
