@@ -116,12 +116,20 @@ class RenderSettings(Contract):
     """Path tracing of the local light fields."""
 
     image_size: int = Field(ge=16, le=256, description="pixels along each side of a light-field image")
-    samples: int = Field(default=16, ge=1, le=65536, description="paths per light-field pixel")
+    samples: int = Field(
+        default=16,
+        ge=1,
+        le=65536,
+        description="paths per light-field pixel, in the mean: more of them where it is noisy",
+    )
     irradiance_samples: int = Field(
         default=1024, ge=1, le=1_000_000, description="paths per texel of the irradiance map"
     )
     between_samples: int = Field(
-        default=64, ge=0, le=65536, description="paths per pixel of the sparse light fields between texels; 0: none"
+        default=16, ge=0, le=65536, description="paths per pixel of the sparse light fields between texels; 0: none"
+    )
+    radiance_cache: bool = Field(
+        default=True, description="end paths of light fields at diffuse surfaces, whose light is taken from a map of it"
     )
     max_depth: int = Field(default=6, ge=0, le=64, description="scattering events on a path, at most")
 
@@ -212,20 +220,20 @@ PRESETS: Final[Mapping[str, BakeSettings]] = {
     "draft": BakeSettings(
         preset="draft",
         lightmap=LightmapSettings(density=1.4, least=32, most=128, irradiance_scale=4, tile=8),
-        render=RenderSettings(image_size=32, samples=32, between_samples=16, irradiance_samples=512),
+        render=RenderSettings(image_size=32, irradiance_samples=512),
         fit=FitSettings(lobes=8, steps=1000, visibility_steps=250),
         package=PackageSettings(environment_size=64),
     ),
     "preview": BakeSettings(
         preset="preview",
         lightmap=LightmapSettings(density=2.8, least=64, most=256, irradiance_scale=4),
-        render=RenderSettings(image_size=64, samples=128),
+        render=RenderSettings(image_size=64),
         fit=FitSettings(lobes=16, steps=2500, visibility_steps=300),
     ),
     "production": BakeSettings(
         preset="production",
         lightmap=LightmapSettings(density=22.0, least=512, most=1024, irradiance_scale=2),
-        render=RenderSettings(image_size=128, samples=128, irradiance_samples=4096, max_depth=8),
+        render=RenderSettings(image_size=128, irradiance_samples=4096, max_depth=8),
         fit=FitSettings(lobes=16, steps=60_000, visibility_steps=24_000),
         package=PackageSettings(environment_size=256),
     ),

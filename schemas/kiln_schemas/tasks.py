@@ -107,6 +107,8 @@ class RenderPayload(Contract):
     """Texel maps of the between points, one a kind (`PrepareResult.between`)."""
     fine: Sha256 | None = None
     """The texel map of the irradiance map (`PrepareResult.fine`)."""
+    cache: Sha256 | None = None
+    """The radiance cache (`PrepareResult.cache`)."""
     tile: Tile
     settings: BakeSettings
     store_url: Url
@@ -175,6 +177,8 @@ class PrepareResult(Contract):
     """Texel maps of the points half-way between texels: to the right, below, and the corner; none where unused."""
     fine: Sha256 | None = None
     """The texel map of the irradiance map; None where the light map has no finer one (`lightmap.irradiance_scale`)."""
+    cache: Sha256 | None = None
+    """What diffuse surfaces receive (`kiln_workers.stages.radiance_cache`); None where paths do without."""
     scene_hash: Sha256
     """Hash of all that the light depends on; render seeds derive from it."""
     resolution: int | None = Field(default=None, ge=SMALLEST_SIDE, le=LARGEST_SIDE)

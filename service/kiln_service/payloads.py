@@ -107,6 +107,7 @@ def _prepared_blobs(job: JobRow) -> dict[str, Any]:
         "texel_map": made["texel_map"],
         "between": made.get("between", ()),
         "fine": made.get("fine"),
+        "cache": made.get("cache"),
     }
 
 

@@ -474,7 +474,8 @@ def _blobs_of(result: Result) -> list[str]:
     """Hashes that the result names."""
     match result:
         case PrepareResult():
-            return [result.scene, result.texel_map, *result.between, *([result.fine] if result.fine else [])]
+            optional = [digest for digest in (result.fine, result.cache) if digest]
+            return [result.scene, result.texel_map, *result.between, *optional]
         case FitResult():
             return [result.weights]
         case RefineResult():

@@ -30,10 +30,10 @@ def seen_from(wi: np.ndarray):
     return si
 
 
-def evaluated(bsdf, wi: np.ndarray, wo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def evaluated(bsdf, wi: np.ndarray, wo: np.ndarray, context=None) -> tuple[np.ndarray, np.ndarray]:
     """BRDF times cosine [K, 3] and density [K]."""
     out = mi.Vector3f(np.ascontiguousarray(wo.T.astype(np.float32)))
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), seen_from(wi), out, True)
+    value, pdf = bsdf.eval_pdf(context or mi.BSDFContext(), seen_from(wi), out, True)
     return np.array(value).T.astype(np.float64), np.array(pdf).astype(np.float64)
 
 

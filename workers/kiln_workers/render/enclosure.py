@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from kiln_workers.render.jit import dr, mi
+from kiln_workers.render.jit import columns, dr, mi
 from kiln_workers.render.paths import PathTracer
 from kiln_workers.scene.model import Float32
 
@@ -38,9 +38,9 @@ def enclosed(tracer: PathTracer, origin: Float32, normal: Float32) -> npt.NDArra
     for first in range(0, len(origin), TEXELS_AT_ONCE):
         part = slice(first, first + TEXELS_AT_ONCE)
         count = len(origin[part])
-        frame = mi.Frame3f(mi.Vector3f(np.repeat(normal[part], len(rays), axis=0).T))
-        direction = frame.to_world(mi.Vector3f(np.tile(rays, (count, 1)).T))
-        start = mi.Point3f(np.repeat(origin[part], len(rays), axis=0).T)
+        frame = mi.Frame3f(columns(mi.Vector3f, np.repeat(normal[part], len(rays), axis=0)))
+        direction = frame.to_world(columns(mi.Vector3f, np.tile(rays, (count, 1))))
+        start = columns(mi.Point3f, np.repeat(origin[part], len(rays), axis=0))
         inside, ends = _crossings(tracer, start, direction)
         inside, ends = (np.array(values).astype(bool).reshape(count, len(rays)) for values in (inside, ends))
         around, above = slice(0, AROUND), slice(AROUND, None)

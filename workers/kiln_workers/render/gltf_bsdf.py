@@ -24,17 +24,32 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
 
-from kiln_workers.render.jit import dr, mi
+from kiln_workers.render.jit import dr, mean, mi
 from kiln_workers.scene.normal_maps import LEAST_FACING, LEAST_HEIGHT
 
 LEAST_CHANCE: Final = 0.1
 """Each of the two lobes that reflects at all is sampled at least this often: bounds the weight of a sample."""
 
 
-def reflections_only() -> Any:
-    """A context in which nothing passes straight through: the caller has already seen to it."""
+DIFFUSE_ALBEDO: Final = "diffuse_albedo"
+"""Name of the attribute that holds the diffuse lobe's albedo."""
+
+MEAN_SCHLICK: Final = 0.028
+"""The mean of (1 - i.h)^5 over cosine-distributed o is this times (1 - cos_i)^2.5, within 0.001."""
+
+
+def reflections_only(*, diffuse: bool = True, glossy: bool = True) -> Any:
+    """A context in which nothing passes straight through: the caller has already seen to it.
+
+    Without `diffuse` or `glossy` that lobe is left out.
+    """
     context = mi.BSDFContext()
-    context.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Null)
+    left_out = int(mi.BSDFFlags.Null)
+    if not diffuse:
+        left_out |= int(mi.BSDFFlags.DiffuseReflection)
+    if not glossy:
+        left_out |= int(mi.BSDFFlags.GlossyReflection)
+    context.type_mask = int(mi.BSDFFlags.All) & ~left_out
     return context
 
 
@@ -92,7 +107,7 @@ def _register(variant: str) -> None:
                 flags = flags | component
             self.m_flags = flags
 
-        def _at(self, si: Any, active: Any) -> _Point:
+        def _at(self, context: Any, si: Any, active: Any) -> _Point:
             base, metallic = self._base(si, active), self.metallic.eval_1(si, active)
             alpha = dr.square(self.roughness.eval_1(si, active))
             kept = 1.0 - metallic
@@ -100,8 +115,12 @@ def _register(variant: str) -> None:
                 kept *= 1.0 - self.transmission.eval_1(si, active)
             albedo, f0 = base * kept, dr.lerp(self.f0, base, metallic)
             f90 = dr.lerp(mi.Float(self.f90), 1.0, metallic)
-            glossy = dr.mean(_schlick(f0, f90, dr.abs(mi.Frame3f.cos_theta(si.wi))))
-            dull = dr.mean(albedo)
+            if not context.is_enabled(mi.BSDFFlags.DiffuseReflection, 0):
+                albedo = mi.Color3f(0.0)
+            if not context.is_enabled(mi.BSDFFlags.GlossyReflection, 1):
+                f0, f90 = mi.Color3f(0.0), mi.Float(0.0)
+            glossy = mean(_schlick(f0, f90, dr.abs(mi.Frame3f.cos_theta(si.wi))))
+            dull = mean(albedo)
             chance = dr.clip(glossy / dr.maximum(glossy + dull, 1e-8), LEAST_CHANCE, 1.0 - LEAST_CHANCE)
             chance = dr.select(dull > 0.0, chance, 1.0)
             frame, side = self._frame(si, active)
@@ -152,6 +171,17 @@ def _register(variant: str) -> None:
             """The base colour: what guides a denoiser, which knows no metals."""
             return dr.select(active, self._base(si, active), 0.0)
 
+        def eval_attribute_3(self, name: str, si: Any, active: Any = True) -> Any:
+            """`DIFFUSE_ALBEDO`: what the diffuse lobe sends back of light that comes evenly from everywhere."""
+            if name != DIFFUSE_ALBEDO:
+                raise ValueError(f"kiln_gltf has no attribute '{name}'")
+            at = self._at(reflections_only(), si, active)
+            cosine = self._inward(si.wi, at).z
+            f0, f90 = at.dielectric
+            away = dr.clip(1.0 - cosine, 0.0, 1.0)
+            reflected = f0 + (f90 - f0) * (MEAN_SCHLICK * dr.square(away) * dr.sqrt(away))
+            return dr.select(active & (cosine > 0.0), at.albedo * (at.opacity * (1.0 - reflected)), 0.0)
+
         def eval_null_transmission(self, si: Any, active: Any = True) -> Any:
             if not self.passes:
                 return mi.Color3f(0.0)
@@ -172,7 +202,7 @@ def _register(variant: str) -> None:
             rest = 1.0 - straight
             choice = dr.select(rest > 0.0, (sample1 - straight) / rest, 0.0)
 
-            at = self._at(si, active)
+            at = self._at(context, si, active)
             wi = self._inward(si.wi, at)
             glossy = choice < at.chance
             half, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, at.alpha, True).sample(wi, sample2)
@@ -199,7 +229,7 @@ def _register(variant: str) -> None:
             return self.eval_pdf(context, si, wo, active)[1]
 
         def eval_pdf(self, context: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            at = self._at(si, active)
+            at = self._at(context, si, active)
             value, pdf = _value_and_pdf(self._inward(si.wi, at), self._inward(wo, at), at)
             straight, _ = self._chance_of_passing(context, si, active)
             active = mi.Bool(active) & self._above(si, wo, at)
@@ -225,7 +255,7 @@ def _register(variant: str) -> None:
             if not self.passes or not context.is_enabled(mi.BSDFFlags.Null, 2):
                 return mi.Float(0.0), mi.Color3f(0.0)
             through = self.eval_null_transmission(si, active)
-            return dr.mean(through), through
+            return mean(through), through
 
         def traverse(self, callback: Any) -> None:
             for name in ("base_color", "roughness", "metallic"):

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from kiln_workers.render.jit import dr, mi
+from kiln_workers.render.jit import column, dr, mi
 
 Floats = npt.NDArray[np.float64]
 
@@ -73,4 +73,4 @@ def packed(values: Any) -> Any:
     """[S, 3 or 4] as a flat Dr.Jit Float [S * 4]."""
     rows = np.zeros((len(values), 4), np.float32)
     rows[:, : values.shape[1]] = values
-    return mi.Float(rows.ravel())
+    return column(mi.Float, rows.ravel())

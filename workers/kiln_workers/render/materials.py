@@ -21,11 +21,14 @@ MIN_ROUGHNESS: Final = 0.05
 """Below this the GGX peak outgrows float32 and no sampler finds it; alpha 0.0025 is a mirror at any image size here."""
 
 
+LIGHTMAP: Final = "vertex_lightmap"
+"""The attribute that holds a vertex' place in the light map: u, v, and -1 where the faces are turned over, else 1."""
+
 ROUND: Final = 0.9999
 """Cosine between a vertex's normal and its face's from which on the two are the same: 0.8 degrees."""
 
 
-def vertex_attributes(mesh: Mesh, material: Material) -> dict[str, Float32]:
+def vertex_attributes(mesh: Mesh, material: Material, turned_over: bool) -> dict[str, Float32]:
     """What a mesh carries beside Mitsuba's own attributes: values [V, 1 or 3] by name."""
     out: dict[str, Float32] = {}
     for number, uv in enumerate(mesh.more_uv, start=1):
@@ -36,6 +39,9 @@ def vertex_attributes(mesh: Mesh, material: Material) -> dict[str, Float32]:
         out["vertex_tangent"], out["vertex_hand"] = mesh.tangents[:, :3], mesh.tangents[:, 3:]
     if rounded_emitter(mesh, material):
         out["vertex_rounded"] = mesh.normals
+    if mesh.lightmap_uv is not None:
+        side = np.full_like(mesh.lightmap_uv[:, :1], -1.0 if turned_over else 1.0)
+        out[LIGHTMAP] = np.concatenate([mesh.lightmap_uv, side], axis=1)
     return out
 
 

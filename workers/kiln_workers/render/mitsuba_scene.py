@@ -38,7 +38,9 @@ def to_mitsuba(scene: Scene) -> Any:
         parts[f"mesh_{number}"] = _mesh(mesh, material, bsdf, materials.emitter(mesh, weight))
         if max(material.emission) > 0.0 and material.double_sided:
             back = back_sheet(mesh, SHEET_GAP * face_clearance(mesh.positions, mesh.faces))
-            parts[f"mesh_{number}_back"] = _mesh(back, material, bsdf, materials.emitter(back, weight))
+            parts[f"mesh_{number}_back"] = _mesh(
+                back, material, bsdf, materials.emitter(back, weight), turned_over=True
+            )
     for number, light in enumerate(scene.lights):
         parts[f"light_{number}"] = _light(light, powers.light_weight(light))
     if scene.environment is not None:
@@ -134,7 +136,7 @@ class _EmitterPowers:
         return environment.scale * mean * np.pi * 4.0 * np.pi * self.radius**2
 
 
-def _mesh(mesh: Mesh, material: Material, bsdf: Any, emitter: Any | None) -> Any:
+def _mesh(mesh: Mesh, material: Material, bsdf: Any, emitter: Any | None, turned_over: bool = False) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     if emitter is not None:
@@ -153,7 +155,7 @@ def _mesh(mesh: Mesh, material: Material, bsdf: Any, emitter: Any | None) -> Any
     if mesh.uv is not None:
         parameters["vertex_texcoords"] = mi.Float(np.ravel(mesh.uv).astype(np.float32))
     parameters.update()
-    for name, values in vertex_attributes(mesh, material).items():
+    for name, values in vertex_attributes(mesh, material, turned_over).items():
         out.add_attribute(name, values.shape[1], np.ravel(values).astype(np.float32))
     dr.eval(parameters["vertex_positions"])
     return out

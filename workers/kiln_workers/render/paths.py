@@ -10,14 +10,17 @@ and transmitting surfaces) dims shadow rays by what it holds back; paths meet it
 """
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from kiln_workers.render import counters
-from kiln_workers.render.gltf_bsdf import reflections_only
-from kiln_workers.render.jit import dr, mi
+from kiln_workers.render.gltf_bsdf import DIFFUSE_ALBEDO, reflections_only
+from kiln_workers.render.jit import dr, mean, mi
+from kiln_workers.render.materials import LIGHTMAP
 from kiln_workers.render.mitsuba_scene import mesh_number, to_mitsuba
 from kiln_workers.scene.model import Scene
 from kiln_workers.scene.precision import face_clearance, face_pull
@@ -61,6 +64,7 @@ class LaneSums:
 
     radiance: Any  # Color3f: sum of weight times radiance
     weight: Any  # Float: sum of the weights of samples in use
+    square: Any  # Float: sum of the squares of weight times the radiance's mean over channels
     paths: Any  # UInt32: samples in use
     dropped: Any  # UInt32: paths that were not finite
 
@@ -68,13 +72,30 @@ class LaneSums:
 class PathTracer:
     """A scene ready to be traced: Mitsuba's scene, offsets against self-intersection, and which surfaces are thin."""
 
+    cache: Any = None
+    """Texture2f of what surfaces receive (`with_cache`)."""
+    knows_backs: bool = False
+    """Whether the cache has the backs of surfaces too."""
+
     def __init__(self, scene: Scene, max_depth: int) -> None:
         self.scene = to_mitsuba(scene)
         self.max_depth = max_depth
         used = [scene.materials[mesh.material] for mesh in scene.meshes]
         self.has_cutouts = any(material.lets_light_pass for material in used)
         self.has_veils = any(material.is_veil for material in used)
+        self.has_backs = any(material.double_sided for material in used)
         self._tabulate(scene)
+
+    def with_cache(self, cache: npt.NDArray[np.floating[Any]]) -> Self:
+        """The same scene, traced with a radiance cache: paths end where they would leave by a diffuse lobe.
+
+        `cache`: irradiance [H, W, 3] of the light map's fronts, or [H, W, 6] of fronts and backs, without what comes
+        straight from punctual lights (`stages.radiance_cache`); negative where paths have to go on.
+        """
+        out = copy(self)
+        out.cache = mi.Texture2f(mi.TensorXf(np.ascontiguousarray(cache, np.float32)))
+        out.knows_backs = cache.shape[2] == 6
+        return out
 
     def _tabulate(self, scene: Scene) -> None:
         """By Dr.Jit's identifier of the shape: is it double-sided, its first face; by face: clearance and pull."""
@@ -120,6 +141,13 @@ class PathTracer:
         """The point [Point3f] on a ray in which it goes on behind a hit."""
         return mi.Point3f(si.p + self._step(si, self._face(si), direction) * direction)
 
+    def behind(self, position: Any, normal: Any, reach: Any) -> Any:
+        """The points [Point3f] behind the surface above which points lie no higher than `reach` [Float] metres."""
+        ray = mi.Ray3f(position, -normal)
+        ray.maxt = reach
+        si = self.scene.ray_intersect(ray)
+        return dr.select(si.is_valid(), self.beyond(si, ray.d), position)
+
     def _step(self, si: Any, face: Any, direction: Any) -> Any:
         """Metres [Float] along `direction` that lead a clearance off the face."""
         cosine = dr.abs(dr.dot(si.n, direction))
@@ -154,7 +182,7 @@ class PathTracer:
         layers, searching = mi.UInt32(0), active & si.is_valid()
         while searching:
             through = si.bsdf().eval_null_transmission(si, searching)
-            share = dr.select(layers < MAX_LAYERS, dr.mean(through), 0.0)
+            share = dr.select(layers < MAX_LAYERS, mean(through), 0.0)
             passes = searching & (chance < share)
             hit = searching & ~passes
             factor = dr.select(passes, factor * through / share, dr.select(hit, factor / (1.0 - share), factor))
@@ -184,7 +212,7 @@ class PathTracer:
         return passed
 
     def _opacity(self, si: Any, active: Any) -> Any:
-        return 1.0 - dr.mean(si.bsdf().eval_null_transmission(si, active))
+        return 1.0 - mean(si.bsdf().eval_null_transmission(si, active))
 
     def unoccluded(self, origin: Any, target: Any, active: Any) -> Any:
         """The part [Color3f] of the light that gets from one point to another."""
@@ -210,23 +238,34 @@ class PathTracer:
         return ds, dr.select(active, weight, 0.0)
 
     @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
-    def trace(self, lanes: Any, samples: Any, start: Callable[[Any, Any], Start], sees_environment: bool) -> LaneSums:
+    def trace(
+        self,
+        lanes: Any,
+        samples: Any,
+        start: Callable[[Any, Any], Start],
+        sees_environment: bool,
+        done: Any | None = None,
+    ) -> LaneSums:
         """Sums over `samples` [UInt32 a lane] paths a lane that begin as `start(sample state, sample)` says.
 
-        `lanes`: UInt64 states. The environment counts at the first ray only with `sees_environment`.
+        `lanes`: UInt64 states. The environment counts at the first ray only with `sees_environment`. With a cache the
+        diffuse lobe of a front is not followed: the cache says what it receives, but for punctual lights. `done`
+        [UInt32 a lane]: how many samples earlier calls have taken, which are not taken again.
         """
         width = dr.width(lanes)
         zeros = dr.zeros(mi.UInt32, width)
         radiance, weight_sum = dr.zeros(mi.Color3f, width), dr.zeros(mi.Float, width)
+        square = dr.zeros(mi.Float, width)
         paths, dropped = mi.UInt32(zeros), mi.UInt32(zeros)
-        sample, depth = mi.UInt32(zeros), mi.UInt32(zeros)
+        sample, depth = mi.UInt32(zeros if done is None else done), mi.UInt32(zeros)
+        last = sample + samples
         state = mi.UInt64(lanes)
         origin, direction = dr.zeros(mi.Point3f, width), dr.zeros(mi.Vector3f, width)
         before, before_pdf = dr.zeros(mi.Point3f, width), dr.zeros(mi.Float, width)
         path_weight = dr.zeros(mi.Float, width)
         throughput, path_radiance = dr.zeros(mi.Color3f, width), dr.zeros(mi.Color3f, width)
         on_path = dr.zeros(mi.Bool, width)
-        running = mi.Bool(samples > 0)
+        running = sample < last
 
         while running:
             # Begin the next path in every lane that is between paths.
@@ -255,13 +294,17 @@ class PathTracer:
             path_radiance += throughput * self._emitted(si, before, before_pdf, emits)
             scatters = on_path & si.is_valid() & (depth < self.max_depth) & ~behind
             si.p = self.vertex(si, direction)
+            known = mi.Bool(False)
+            if dr.hint(self.cache is not None, mode="scalar"):
+                received, known = self._received(si, direction, scatters)
+                path_radiance += throughput * received
             state, u = counters.pair(state)
-            path_radiance += throughput * self._direct(si, direction, u, scatters)
+            path_radiance += throughput * self._direct(si, direction, u, scatters, known)
 
             # Continue in a direction drawn from the BSDF.
             state, u = counters.pair(state)
             state, choice = counters.pair(state)
-            scattered, factor = si.bsdf().sample(reflections_only(), si, choice.x, u, scatters)
+            scattered, factor = self._sample(si, choice.x, u, scatters, known)
             onwards = si.to_world(scattered.wo)
             scatters &= dr.dot(si.n, onwards) * dr.dot(si.n, direction) < 0.0
             throughput *= factor
@@ -275,6 +318,7 @@ class PathTracer:
             finite = dr.all(dr.isfinite(path_radiance))
             counted = on_path & ends
             radiance += dr.select(counted & finite, path_weight * path_radiance, 0.0)
+            square += dr.select(counted & finite, dr.square(path_weight * mean(path_radiance)), 0.0)
             weight_sum += dr.select(counted & finite, path_weight, 0.0)
             dropped += dr.select(counted & ~finite, 1, 0)
             paths += dr.select(counted, 1, 0)
@@ -283,15 +327,18 @@ class PathTracer:
             before, before_pdf = mi.Point3f(si.p), mi.Float(scattered.pdf)
             origin, direction = mi.Point3f(si.p), mi.Vector3f(onwards)
             depth += 1
-            running = on_path | (sample < samples)
+            running = on_path | (sample < last)
 
-        return LaneSums(radiance, weight_sum, paths, dropped)
+        return LaneSums(radiance, weight_sum, square, paths, dropped)
 
     @dr.syntax  # type: ignore[untyped-decorator, unused-ignore]
-    def direct(self, lanes: Any, samples: Any, position: Any, normal: Any, shading_normal: Any) -> Any:
+    def direct(
+        self, lanes: Any, samples: Any, position: Any, normal: Any, shading_normal: Any, punctual: bool = True
+    ) -> Any:
         """Sum [Color3f] over `samples` next-event estimates of the irradiance at points of a surface.
 
-        Weighted against cosine-distributed paths that see the environment, which `trace` takes.
+        Weighted against cosine-distributed paths that see the environment, which `trace` takes. Not `punctual`: without
+        what comes from lights that are points or directions.
         """
         total = dr.zeros(mi.Color3f, dr.width(lanes))
         sample = dr.zeros(mi.UInt32, dr.width(lanes))
@@ -303,7 +350,8 @@ class PathTracer:
             ds, arriving = self.light_at(at, counters.stratified_pair(lanes, sample), active)
             cosine = dr.dot(shading_normal, ds.d)
             above = (cosine > 0.0) & (dr.dot(normal, ds.d) > 0.0)
-            share = dr.select(ds.delta, 1.0, _power_heuristic(ds.pdf, cosine * dr.inv_pi))
+            alone = mi.Float(1.0 if punctual else 0.0)
+            share = dr.select(ds.delta, alone, _power_heuristic(ds.pdf, cosine * dr.inv_pi))
             arriving = arriving * cosine * share
             total += dr.select(above & dr.all(dr.isfinite(arriving)), arriving, 0.0)
             sample += 1
@@ -321,16 +369,47 @@ class PathTracer:
         light_pdf = dr.select(sampled, self.scene.pdf_emitter_direction(reference, seen, sampled), 0.0)
         return dr.select(active, seen.emitter.eval(si, active), 0.0) * _power_heuristic(before_pdf, light_pdf)
 
-    def _direct(self, si: Any, direction: Any, sample: Any, active: Any) -> Any:
+    def _direct(self, si: Any, direction: Any, sample: Any, active: Any, known: Any) -> Any:
         """Light [Color3f] that reaches the hit straight from an emitter and is scattered back along the ray.
 
-        Weighted against BSDF sampling.
+        Weighted against BSDF sampling. Where `known`, the cache has what comes from emitters that are not punctual and
+        leaves by the diffuse lobe.
         """
         ds, arriving = self.light_at(si, sample, active)
-        value, pdf = si.bsdf().eval_pdf(reflections_only(), si, si.to_local(ds.d), active)
+        value, pdf = self._eval(si, si.to_local(ds.d), active, known, ds.delta)
         same_side = dr.dot(si.n, ds.d) * dr.dot(si.n, direction) < 0.0
         share = dr.select(ds.delta, 1.0, _power_heuristic(ds.pdf, pdf))
         return dr.select(active & same_side, value * arriving * share, 0.0)
+
+    def _eval(self, si: Any, wo: Any, active: Any, known: Any, punctual: Any) -> tuple[Any, Any]:
+        """BRDF times cosine [Color3f] and density, of the glossy lobe alone where `known` and not `punctual`."""
+        bsdf = si.bsdf()
+        if self.cache is None:
+            return tuple(bsdf.eval_pdf(reflections_only(), si, wo, active))
+        value, pdf = bsdf.eval_pdf(reflections_only(diffuse=False), si, wo, active)
+        whole, whole_pdf = bsdf.eval_pdf(reflections_only(), si, wo, active & (~known | punctual))
+        return dr.select(known & ~punctual, value, whole), dr.select(known, pdf, whole_pdf)
+
+    def _sample(self, si: Any, choice: Any, sample: Any, active: Any, known: Any) -> tuple[Any, Any]:
+        """A direction drawn from the BSDF, from its glossy lobe alone where `known`; and the factor on its radiance."""
+        bsdf = si.bsdf()
+        if self.cache is None:
+            return tuple(bsdf.sample(reflections_only(), si, choice, sample, active))
+        scattered, factor = bsdf.sample(reflections_only(diffuse=False), si, choice, sample, active & known)
+        whole, whole_factor = bsdf.sample(reflections_only(), si, choice, sample, active & ~known)
+        return dr.select(known, scattered, whole), dr.select(known, factor, whole_factor)
+
+    def _received(self, si: Any, direction: Any, active: Any) -> tuple[Any, Any]:
+        """What the diffuse lobe [Color3f] sends back of the light that the cache knows, and whether it knows any."""
+        at = si.shape.eval_attribute_3(LIGHTMAP, si, active)
+        held = self.cache.eval(mi.Point2f(at.x, at.y), active)
+        irradiance = mi.Color3f(held[:3])
+        front = (dr.dot(si.n, direction) < 0.0) ^ (at.z < 0.0)
+        if self.knows_backs:
+            irradiance = dr.select(front, irradiance, mi.Color3f(held[3:]))
+        known = active & (front | self.knows_backs) & (irradiance.x >= 0.0)
+        albedo = si.bsdf().eval_attribute_3(DIFFUSE_ALBEDO, si, known)
+        return dr.select(known, irradiance * dr.inv_pi * albedo, 0.0), known
 
     def _orient(self, si: Any, ray: Any) -> None:
         """Replace an interpolated normal that faces away from the ray while the surface faces it, or vice versa."""

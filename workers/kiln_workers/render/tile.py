@@ -16,9 +16,9 @@ import numpy.typing as npt
 from kiln_schemas.conventions import FP16_MAX
 from kiln_schemas.errors import MachineLacks
 from kiln_schemas.settings import RenderSettings
-from kiln_workers.render import counters, enclosure
+from kiln_workers.render import adaptive, counters, enclosure
 from kiln_workers.render.backend import Device, select_variant
-from kiln_workers.render.jit import dr, mi
+from kiln_workers.render.jit import column, columns, dr, mi, to_numpy
 from kiln_workers.render.paths import TEXEL_OFFSET, LaneSums, PathTracer, Start
 from kiln_workers.render.visibility import RayTable, texel_hash, trace_visibility, weighted_visibility
 from kiln_workers.scene.model import Float32, Scene
@@ -33,6 +33,9 @@ BYTES_PER_LANE: Final = 192
 
 LARGEST_WAVEFRONT: Final = 1 << 22
 SMALLEST_WAVEFRONT: Final = 1 << 12
+
+RADIANCE, WEIGHT, SQUARE, PATHS, DROPPED = slice(0, 3), 3, 4, 5, 6
+"""Columns of a lane's sums (`paths.LaneSums`)."""
 
 IRRADIANCE_BLOCK: Final = 16
 """Irradiance samples per lane: few, so that the few texels of a tile fill many lanes."""
@@ -92,16 +95,25 @@ def silent(fraction: float) -> None:
 class TileRenderer:
     """Renders batches of texels of one scene; keep it while the scene stays the same.
 
-    `memory_bytes` bounds what a wavefront takes besides the scene, the compiled kernels and the images themselves.
+    `memory_bytes` bounds what a wavefront takes besides the scene, the compiled kernels and the images themselves. With
+    a radiance `cache` [H, W, 3 or 6] (`stages.radiance_cache`) light fields are traced with its help; irradiance never
+    is, whose noise is mostly of direct light.
     """
 
     def __init__(
-        self, scene: Scene, scene_hash: str, settings: RenderSettings, memory_bytes: int, device: Device = "auto"
+        self,
+        scene: Scene,
+        scene_hash: str,
+        settings: RenderSettings,
+        memory_bytes: int,
+        device: Device = "auto",
+        cache: Float16 | None = None,
     ) -> None:
         select_variant(device)
         self.settings = settings
         self.key = int(scene_hash[:16], 16)
         self.tracer = PathTracer(scene, settings.max_depth)
+        self.field_tracer = self.tracer if cache is None else self.tracer.with_cache(cache)
         self.wavefront = wavefront_lanes(memory_bytes)
         self.table = None if scene.environment is None else RayTable.make(scene.environment, settings.image_size)
         self.pixel_area = 4.0 / settings.image_size**2
@@ -138,16 +150,33 @@ class TileRenderer:
         traced, that row and column of the block, and no texel is judged.
         """
         size, samples = self.settings.image_size, samples or self.settings.samples
+        even = adaptive.even_samples(samples)
         out = np.zeros((len(texels), size * size, 3), np.float16)
         paths = overflows = 0
-        for part, fraction in self._pixel_wavefronts(texels, offsets):
-            texel, pixel = part[:, 0], part[:, 1]
-            sums = self._trace_pixels(texels, texel, pixel, samples)
-            mean = np.array(sums.radiance).T / np.maximum(np.array(sums.weight), 1e-30)[:, None]
-            out[texel, pixel], clamped = to_half(mean)
-            paths += int(np.array(sums.paths).sum())
-            overflows += clamped + int(np.array(sums.dropped).sum())
-            on_progress(fraction)
+        for first, lanes in self._whole_images(texels, offsets):
+            begun = first / len(texels)
+            share = (int(lanes[-1, 0]) + 1 - first) / len(texels) if len(lanes) else 0.0
+
+            def report(done: float, begun: float = begun, share: float = share) -> None:
+                on_progress(begun + share * done)
+
+            count = np.full(len(lanes), even)
+            sums = self._trace_lanes(texels, lanes, count, 0, lambda done: report(done * even / samples))
+            if even < samples and len(lanes):
+                more = self._more_samples(lanes, sums, samples, size if offsets is None else size // 2)
+                order = _by_count(more)
+                sums[order] += self._trace_lanes(
+                    texels,
+                    lanes[order],
+                    more[order],
+                    even,
+                    lambda done: report((even + done * (samples - even)) / samples),
+                )
+            mean = (sums[:, RADIANCE] / np.maximum(sums[:, WEIGHT], 1e-30)[:, None]).astype(np.float32)
+            out[lanes[:, 0], lanes[:, 1]], clamped = to_half(mean)
+            paths += int(sums[:, PATHS].sum(dtype=np.float64))
+            overflows += clamped + int(sums[:, DROPPED].sum(dtype=np.float64))
+        on_progress(1.0)
         enclosed = self._enclosed(texels, out) if offsets is None else np.zeros(len(texels), bool)
         return TileImages(
             light_field=out.reshape(len(texels), size, size, 3),
@@ -158,11 +187,38 @@ class TileRenderer:
             overflows=overflows,
         )
 
-    def _trace_pixels(self, texels: TexelBatch, texel: Int64, pixel: Int64, samples: int) -> LaneSums:
+    def _more_samples(self, lanes: Int64, sums: Float32, samples: int, side: int) -> Int64:
+        """How many paths lanes [L] get after their even ones; `side`: traced pixels along an image's side."""
+        step = self.settings.image_size // side
+        texel = lanes[:, 0] - lanes[0, 0]
+        row, column = np.divmod(lanes[:, 1], self.settings.image_size)
+        place = texel, row // step, column // step
+        count = np.maximum(sums[:, PATHS].astype(np.float64), 1.0)
+        mean, square = sums[:, RADIANCE].mean(axis=1) / count, sums[:, SQUARE] / count
+        grids = np.zeros((3, int(texel[-1]) + 1, side, side))
+        for grid, values in zip(grids, (mean, np.maximum(square - mean**2, 0.0), np.ones(len(lanes))), strict=True):
+            grid[place] = values
+        return np.asarray(adaptive.more_samples(grids[0], grids[1], grids[2] > 0.0, samples)[place])
+
+    def _trace_lanes(
+        self, texels: TexelBatch, lanes: Int64, samples: Int64, done: int, on_progress: Progress
+    ) -> Float32:
+        """What lanes [L] add up over `samples` [L] paths after the first `done`: a row [L, 7] of sums each."""
+        out = np.zeros((len(lanes), 7), np.float32)
+        for first in range(0, len(lanes), self.wavefront):
+            part = slice(first, first + self.wavefront)
+            sums = self._trace_pixels(texels, lanes[part, 0], lanes[part, 1], samples[part], done)
+            out[part, RADIANCE] = to_numpy(sums.radiance)
+            for number, values in enumerate((sums.weight, sums.square, sums.paths, sums.dropped), start=WEIGHT):
+                out[part, number] = np.array(values)
+            on_progress(min(first + self.wavefront, len(lanes)) / len(lanes))
+        return out
+
+    def _trace_pixels(self, texels: TexelBatch, texel: Int64, pixel: Int64, samples: Int64, done: int) -> LaneSums:
         """One wavefront of light-field pixels."""
         size = self.settings.image_size
         points = _Points(texels, texel)
-        pixels = mi.UInt32(pixel.astype(np.uint32))
+        pixels = column(mi.UInt32, pixel.astype(np.uint32))
         corner = mi.Vector2f(mi.Float(pixels % size), mi.Float(pixels // size))
         density = self.pixel_area / dr.gather(mi.Float, self.solid_angles, pixels)
         lanes = counters.lane_state(self.key, counters.STREAM_LIGHT_FIELD, points.index, pixels)
@@ -173,13 +229,20 @@ class TileRenderer:
             direction, jacobian = octahedral_direction(xy)
             return Start(points.origin, direction, jacobian * density, 0.0, dr.dot(direction, points.normal) > 0.0)
 
-        count = dr.full(mi.UInt32, samples, len(texel))
-        sums: LaneSums = self.tracer.trace(lanes, count, start, False)
-        dr.eval(sums.radiance, sums.weight, sums.paths, sums.dropped)
+        count = column(mi.UInt32, samples.astype(np.uint32))
+        # Not a literal, so that one kernel serves every value.
+        before = column(mi.UInt32, np.full(len(texel), done, np.uint32))
+        sums: LaneSums = self.field_tracer.trace(lanes, count, start, False, before)
+        dr.eval(sums.radiance, sums.weight, sums.square, sums.paths, sums.dropped)
         return sums
 
-    def render_irradiance(self, texels: TexelBatch, on_progress: Progress = silent) -> tuple[Float32, int, int]:
-        """Irradiance [T, 3] alone, how many paths it took, and how many were dropped because they were not finite."""
+    def render_irradiance(
+        self, texels: TexelBatch, on_progress: Progress = silent, *, punctual: bool = True
+    ) -> tuple[Float32, int, int]:
+        """Irradiance [T, 3] alone, how many paths it took, and how many were dropped because they were not finite.
+
+        Not `punctual`: without what comes straight from lights that are points or directions.
+        """
         samples = self.settings.irradiance_samples
         blocks = -(-samples // IRRADIANCE_BLOCK)
         total = np.zeros((len(texels), blocks, 3), np.float64)
@@ -188,18 +251,34 @@ class TileRenderer:
         for part, fraction in self._wavefronts(grid):
             texel, block = part[:, 0], part[:, 1]
             counts = np.minimum(samples - block * IRRADIANCE_BLOCK, IRRADIANCE_BLOCK)
-            paths, direct = self._trace_irradiance(texels, texel, block, counts)
+            paths, direct = self._trace_irradiance(texels, texel, block, counts, punctual)
             # Sum each texel's blocks in one fixed order, whatever the wavefronts were.
-            total[texel, block] = np.array(paths.radiance).T + np.array(direct).T
+            total[texel, block] = to_numpy(paths.radiance) + to_numpy(direct)
             dropped += int(np.array(paths.dropped).sum())
             on_progress(fraction)
         return (total.sum(axis=1) / samples).astype(np.float32), len(texels) * samples, dropped
 
-    def render_fine_irradiance(self, texels: TexelBatch, on_progress: Progress = silent) -> tuple[Float32, int, int]:
+    def render_fine_irradiance(
+        self, texels: TexelBatch, on_progress: Progress = silent, *, punctual: bool = True
+    ) -> tuple[Float32, int, int]:
         """The same of a finer map's texels: -1 where no light reaches a point and it lies inside something."""
-        irradiance, paths, dropped = self.render_irradiance(texels, on_progress)
+        irradiance, paths, dropped = self.render_irradiance(texels, on_progress, punctual=punctual)
         irradiance[self._enclosed(texels, irradiance)] = INSIDE_GEOMETRY
         return irradiance, paths, dropped
+
+    def backs(self, texels: TexelBatch) -> TexelBatch:
+        """The same points on the other side of their surfaces, as seen from there."""
+        behind = self.tracer.behind(
+            columns(mi.Point3f, texels.position),
+            columns(mi.Vector3f, texels.normal),
+            column(mi.Float, texels.texel_size),
+        )
+        return replace(
+            texels,
+            position=to_numpy(behind),
+            normal=-texels.normal,
+            shading_normal=-texels.shading_normal,
+        )
 
     def _enclosed(self, texels: TexelBatch, light: Float16 | Float32) -> npt.NDArray[np.bool_]:
         """Which texels [T] lie inside something, of those that have no light [T, ...]; the others are not asked."""
@@ -208,10 +287,12 @@ class TileRenderer:
         out[dark] = enclosure.enclosed(self.tracer, _origins(texels)[dark], texels.normal[dark])
         return out
 
-    def _trace_irradiance(self, texels: TexelBatch, texel: Int64, block: Int64, counts: Int64) -> tuple[LaneSums, Any]:
+    def _trace_irradiance(
+        self, texels: TexelBatch, texel: Int64, block: Int64, counts: Int64, punctual: bool
+    ) -> tuple[LaneSums, Any]:
         """One wavefront of blocks of irradiance samples: cosine-distributed paths, and next-event estimates."""
         points = _Points(texels, texel)
-        blocks, count = mi.UInt32(block.astype(np.uint32)), mi.UInt32(counts.astype(np.uint32))
+        blocks, count = (column(mi.UInt32, values.astype(np.uint32)) for values in (block, counts))
         # The texel's samples form one low-discrepancy set over all of its blocks.
         shared = counters.lane_state(self.key, counters.STREAM_IRRADIANCE, points.index, mi.UInt32(0))
         lanes = counters.lane_state(self.key, counters.STREAM_IRRADIANCE, points.index, blocks + 1)
@@ -228,7 +309,7 @@ class TileRenderer:
 
         paths = self.tracer.trace(lanes, count, start, True)
         direct_lanes = counters.lane_state(self.key, counters.STREAM_DIRECT, points.index, blocks)
-        direct = self.tracer.direct(direct_lanes, count, points.origin, points.normal, points.shading_normal)
+        direct = self.tracer.direct(direct_lanes, count, points.origin, points.normal, points.shading_normal, punctual)
         dr.eval(paths.radiance, paths.dropped, direct)
         return paths, direct
 
@@ -243,31 +324,37 @@ class TileRenderer:
             numbers = slice(first, first + group)
             lanes = lanes_above_horizon(texels.normal[numbers], size)
             points = _Points(texels, lanes[:, 0] + first)
-            pixels = mi.UInt32(lanes[:, 1].astype(np.uint32))
+            pixels = column(mi.UInt32, lanes[:, 1].astype(np.uint32))
             hashes = texel_hash(self.key, points.index)
             seen, above = trace_visibility(self.tracer, self.table, hashes, pixels, points.origin, points.normal)
             dr.eval(seen, above)
             values = weighted_visibility(
-                self.table, size, texels.alpha[numbers], lanes, np.array(seen), np.array(above)
+                self.table,
+                size,
+                texels.alpha[numbers],
+                lanes,
+                to_numpy(seen).T if self.tracer.has_veils else np.array(seen),
+                np.array(above),
             )
             out[lanes[:, 0] + first, lanes[:, 1]] = values.astype(np.float16)
             on_progress(min(first + group, len(texels)) / len(texels))
         return out.reshape(len(texels), size, size, 3)
 
-    def _pixel_wavefronts(self, texels: TexelBatch, offsets: Int64 | None) -> Iterator[tuple[Int64, float]]:
-        """Wavefronts (texel, pixel) [L, 2] of the pixels above the horizon, and the fraction done after each."""
+    def _whole_images(self, texels: TexelBatch, offsets: Int64 | None) -> Iterator[tuple[int, Int64]]:
+        """The first texel of each group, and (texel, pixel) [L, 2] of the group's pixels above the horizon.
+
+        A group has about as many pixels as a wavefront. With `offsets` only one pixel of each 2 x 2 block is listed.
+        """
         size = self.settings.image_size
-        # About half of the pixels are above, so this many texels fill a wavefront.
+        # About half of the pixels are above.
         group = max(1, 2 * self.wavefront // (size * size))
         for first in range(0, len(texels), group):
-            normals = texels.normal[first : first + group]
-            lanes = lanes_above_horizon(normals, size)
+            lanes = lanes_above_horizon(texels.normal[first : first + group], size)
             lanes[:, 0] += first
             if offsets is not None:
                 inside = np.stack(np.divmod(lanes[:, 1], size), axis=1) % 2
                 lanes = lanes[(inside == offsets[lanes[:, 0]]).all(axis=1)]
-            for part, fraction in self._wavefronts(lanes):
-                yield part, (first + fraction * len(normals)) / len(texels)
+            yield first, lanes
 
     def _wavefronts(self, lanes: Int64) -> Iterator[tuple[Int64, float]]:
         for first in range(0, len(lanes), self.wavefront):
@@ -280,10 +367,10 @@ class _Points:
 
     def __init__(self, texels: TexelBatch, texel: Int64) -> None:
         origin = _origins(texels)
-        self.index = mi.UInt64(texels.index[texel].astype(np.uint64))
-        self.origin = mi.Point3f(np.ascontiguousarray(origin[texel].T))
-        self.normal = mi.Vector3f(np.ascontiguousarray(texels.normal[texel].T))
-        self.shading_normal = mi.Vector3f(np.ascontiguousarray(texels.shading_normal[texel].T))
+        self.index = column(mi.UInt64, texels.index[texel].astype(np.uint64))
+        self.origin = columns(mi.Point3f, origin[texel])
+        self.normal = columns(mi.Vector3f, texels.normal[texel])
+        self.shading_normal = columns(mi.Vector3f, texels.shading_normal[texel])
 
 
 def _origins(texels: TexelBatch) -> Float32:
@@ -301,6 +388,13 @@ def wavefront_lanes(memory_bytes: int) -> int:
             remedy=f"Allow at least {SMALLEST_WAVEFRONT * BYTES_PER_LANE >> 20 or 1} MiB.",
         )
     return int(lanes)
+
+
+def _by_count(samples: Int64) -> Int64:
+    """The lanes that have something to do, of those that take about as many paths (a factor of 1.4) side by side."""
+    level = np.where(samples > 0, np.ceil(2.0 * np.log2(np.maximum(samples, 1))) + 1.0, 0.0)
+    order = np.argsort(-level, kind="stable")
+    return np.asarray(order[: np.count_nonzero(samples)], dtype=np.int64)
 
 
 def lanes_above_horizon(normals: Float32, size: int) -> Int64:

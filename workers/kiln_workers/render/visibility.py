@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from kiln_workers.render import counters, lobes
 from kiln_workers.render.environment import environment_samples, octahedral_energy, pixel_of
-from kiln_workers.render.jit import dr, mi
+from kiln_workers.render.jit import column, columns, dr, mi, to_numpy
 from kiln_workers.render.paths import PathTracer
 from kiln_workers.scene.model import Environment, Float32
 from kiln_workers.sphere import octahedral
@@ -148,17 +148,17 @@ def _convolved(
     rows = np.minimum(pairs[:, None] + np.arange(lobes.TARGETS), ends[:, None] - 1)
     directions = octahedral.pixel_directions(size).reshape(-1, 3).astype(np.float32)[lanes[rows, 1]]
     sums = lobes.lobe_sums(
-        [mi.Vector3f(np.ascontiguousarray(directions[:, k].T)) for k in range(lobes.TARGETS)],
-        mi.Float(lobes.resolved_alpha(alpha[owner], grid).astype(np.float32)),
-        mi.UInt32(first[owner].astype(np.uint32)),
-        mi.UInt32(last[owner].astype(np.uint32)),
+        [columns(mi.Vector3f, directions[:, k]) for k in range(lobes.TARGETS)],
+        column(mi.Float, lobes.resolved_alpha(alpha[owner], grid).astype(np.float32)),
+        column(mi.UInt32, first[owner].astype(np.uint32)),
+        column(mi.UInt32, last[owner].astype(np.uint32)),
         lobes.packed(octahedral.pixel_directions(grid).reshape(-1, 3)[source]),
         [lobes.packed(numerator), lobes.packed(denominator)],
     )
     dr.eval(sums)
     out = np.empty((len(lanes), 3), np.float32)
     for k, (top, bottom) in enumerate(sums):
-        out[rows[:, k]] = _ratio(np.array(top).T, np.array(bottom).T)
+        out[rows[:, k]] = _ratio(to_numpy(top), to_numpy(bottom))
     return out
 
 

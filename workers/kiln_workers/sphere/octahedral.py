@@ -57,6 +57,15 @@ def pixel_of(directions: Floats, size: int) -> npt.NDArray[np.int64]:
     return np.asarray(row * size + column)
 
 
+def padded(values: Floats) -> Floats:
+    """Images [..., R, R] with a ring around them [..., R + 2, R + 2]: the pixels that lie there on the sphere.
+
+    Beyond an edge of the square the sphere goes on at the same edge, seen in a mirror; its four corners are one point.
+    """
+    rows = np.concatenate([values[..., :1, ::-1], values, values[..., -1:, ::-1]], axis=-2)
+    return np.concatenate([rows[..., ::-1, :1], rows, rows[..., ::-1, -1:]], axis=-1)
+
+
 @lru_cache(maxsize=8)
 def pixel_solid_angles(size: int) -> Floats:
     """Exact solid angles [R, R] of the pixels in steradians (R even); they sum to 4 pi. Read-only: shared.

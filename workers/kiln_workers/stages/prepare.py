@@ -8,7 +8,7 @@ from typing import Final
 
 from kiln_schemas.errors import InputError, TooLarge
 from kiln_schemas.job import check_bundle
-from kiln_schemas.settings import BakeSettings, Function, PackagedScene, Solver
+from kiln_schemas.settings import BakeSettings, Function, PackagedScene, RenderSettings, Solver
 from kiln_schemas.tasks import MOST_NOTES, MOST_PLACEMENTS, MOST_TILES, PreparePayload, PrepareResult
 from kiln_workers.package.original import check_original
 from kiln_workers.render.between import between_bands
@@ -31,6 +31,7 @@ from kiln_workers.scene.texel_map import (
 )
 from kiln_workers.scene.texels import TexelMaker
 from kiln_workers.stages.bundle import lay_out
+from kiln_workers.stages.radiance_cache import LARGEST_CACHE, make_cache, pack_cache
 from kiln_workers.stages.tiles import plan_tiles
 from kiln_workers.store.layout import BETWEEN_STEPS, TEXEL_MAP_ARRAYS
 from kiln_workers.store.light_field import LightFieldStore
@@ -41,6 +42,7 @@ STEPS: Final = (
     "laying out the light map",
     "placing the texels",
     "placing the points between",
+    "lighting the surfaces",
     "saving",
 )
 
@@ -85,16 +87,19 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
     between = _put_between(scene, texel_map, context) if traces_between(settings) else ()
     fine_side = settings.lightmap.irradiance_side(lightmap.resolution)
     finer = fine_side > lightmap.resolution
-    fine = context.put_blob(_texel_map_file(scene, fine_side, context)) if finer else None
+    fine_path = _texel_map_file(scene, fine_side, context) if finer else path
     step(5)
     digest = scene_hash(scene, settings.render)
+    cache = _put_cache(scene, digest, (path, fine_path), settings.render, context)
+    step(6)
     _create_store(payload.store_url, scene, texel_map, digest, settings)
     context.log(f"{scene.triangles} triangles, {texel_map.covered} texels in {len(tiles)} tiles")
     return PrepareResult(
         scene=context.put_blob(pack_scene(scene)),
         texel_map=context.put_blob(path),
         between=between,
-        fine=fine,
+        fine=context.put_blob(fine_path) if finer else None,
+        cache=cache,
         scene_hash=digest,
         resolution=lightmap.resolution,
         placements=lightmap.placements[:MOST_PLACEMENTS],
@@ -124,6 +129,26 @@ def _put_between(scene: Scene, texel_map: TexelMap, context: Context) -> tuple[s
         digests.append(context.put_blob(path))
         path.unlink()
     return tuple(digests)
+
+
+def _put_cache(
+    scene: Scene, digest: str, paths: Sequence[Path], settings: RenderSettings, context: Context
+) -> str | None:
+    """The radiance cache as a blob, at the finest of the texel maps that is not too large; None where paths do without.
+
+    The texel maps lie in files, from the coarsest to the finest.
+    """
+    if not (settings.radiance_cache and settings.max_depth and scene.has_light):
+        return None
+    maps = [open_texel_map(path) for path in paths]
+    fitting = [texel_map for texel_map in maps if len(texel_map.state) <= LARGEST_CACHE]
+    texel_map = fitting[-1] if fitting else open_texel_map(_texel_map_file(scene, LARGEST_CACHE, context))
+
+    def report(done: float) -> None:
+        context.progress(5 + done, len(STEPS), "steps", STEPS[5])
+
+    cache = make_cache(scene, digest, texel_map, settings, context.memory_bytes, report)
+    return context.put_blob(pack_cache(cache))
 
 
 def traces_between(settings: BakeSettings) -> bool:

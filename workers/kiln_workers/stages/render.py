@@ -15,6 +15,7 @@ from kiln_workers.render.tile import TexelBatch, TileRenderer
 from kiln_workers.runner.context import Context
 from kiln_workers.scene.archive import unpack_scene
 from kiln_workers.scene.texel_map import TexelMap, TexelState, unpack_texel_map
+from kiln_workers.stages.radiance_cache import unpack_cache
 from kiln_workers.stages.tiles import covered_texels, map_coordinates
 from kiln_workers.store.light_field import LightFieldStore
 
@@ -26,10 +27,10 @@ _WARM: Final = "render"
 FINE_SEQUENCE: Final = 16
 """The finer irradiance's random numbers begin after those of the texels and of all points between."""
 
-FINE_SHARE: Final = 0.1
+FINE_SHARE: Final = 0.2
 """About what the finer irradiance takes of a tile's time."""
 
-BETWEEN_SHARE: Final = 0.2
+BETWEEN_SHARE: Final = 0.3
 """About what the light fields between texels take of a tile's time: three points a texel, a quarter of the pixels."""
 
 
@@ -114,14 +115,21 @@ class _Warm:
 
 
 def _warm(payload: RenderPayload, context: Context) -> _Warm:
-    key = (payload.scene, payload.texel_map, payload.between, payload.fine, payload.store_url, payload.settings.render)
+    maps = (payload.texel_map, payload.between, payload.fine, payload.cache)
+    key = (payload.scene, maps, payload.store_url, payload.settings.render)
     warm = context.cache.get(_WARM)
     if not isinstance(warm, _Warm) or warm.key != key:
         context.cache.pop(_WARM, None)
         select_variant(threads=context.threads)
         store = LightFieldStore.open(payload.store_url)
         scene = unpack_scene(context.blob(payload.scene))
-        renderer = TileRenderer(scene, store.attributes["scene_hash"], payload.settings.render, context.memory_bytes)
+        renderer = TileRenderer(
+            scene,
+            store.attributes["scene_hash"],
+            payload.settings.render,
+            context.memory_bytes,
+            cache=None if payload.cache is None else unpack_cache(context.blob(payload.cache)),
+        )
         between = tuple(unpack_texel_map(context.blob(digest)) for digest in payload.between)
         fine = None if payload.fine is None else unpack_texel_map(context.blob(payload.fine))
         warm = _Warm(key, renderer, unpack_texel_map(context.blob(payload.texel_map)), between, fine, store)
