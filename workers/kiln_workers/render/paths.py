@@ -93,7 +93,8 @@ class PathTracer:
         straight from punctual lights (`stages.radiance_cache`); negative where paths have to go on.
         """
         out = copy(self)
-        out.cache = mi.Texture2f(mi.TensorXf(np.ascontiguousarray(cache, np.float32)))
+        # Not by a GPU's texture units, which interpolate with 8 bits.
+        out.cache = mi.Texture2f(mi.TensorXf(np.ascontiguousarray(cache, np.float32)), use_accel=False)
         out.knows_backs = cache.shape[2] == 6
         return out
 
