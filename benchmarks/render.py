@@ -129,7 +129,7 @@ def measure(name: str, scene: Scene, settings: RenderSettings, count: int) -> di
 
 def bytes_per_lane(scene: Scene) -> float:
     """Growth of peak memory from wavefronts of 2^14 lanes to one of all lanes, per lane."""
-    settings = RenderSettings(image_size=128, samples=1, irradiance_samples=1)
+    settings = RenderSettings(image_size=128, samples=8, irradiance_samples=1)
     texels = floor_texels(256)
     lanes = len(lanes_above_horizon(texels.normal, settings.image_size))
     tile = TileRenderer(scene, "5" * 64, settings, 1 << 30)

@@ -28,7 +28,7 @@ def images(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def slow_shares(mean: np.ndarray, variance: np.ndarray, above: np.ndarray) -> np.ndarray:
     """Each pixel's share [R, R] of one image's paths, pixel by pixel, before any bound."""
     neighbours = {place: around for place, around in neighbours_of(SIZE).items() if above[place]}
-    exposure = 0.18 / mean[above].mean()
+    exposure = EXPOSURE_KEY / mean[above].mean()
     spread = np.zeros((SIZE, SIZE))
     for place, around in neighbours.items():
         seen = [other for other in around if above[other]]
@@ -70,8 +70,7 @@ def test_neighbours_beyond_an_edge_are_near_on_the_sphere() -> None:
     assert np.array_equal(ring[1:-1, 1:-1], directions)
 
 
-def test_shares_are_those_of_a_slow_computation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adaptive, "EXPOSURE_KEY", 0.18)
+def test_shares_are_those_of_a_slow_computation() -> None:
     mean, variance, above = images(1)
     samples = 1000  # so many that rounding to whole paths is nothing
     more = adaptive.more_samples(mean, variance, above, samples)

@@ -11,6 +11,7 @@ from test_gltf_bsdf import direction, evaluated, seen_from, surface, upper
 from kiln_schemas.errors import InputError
 from kiln_schemas.settings import RenderSettings
 from kiln_workers.render.gltf_bsdf import DIFFUSE_ALBEDO, reflections_only
+from kiln_workers.render.materials import LIGHTMAP, vertex_attributes
 from kiln_workers.render.tile import TexelBatch, TileRenderer
 from kiln_workers.scene.container import pack
 from kiln_workers.scene.model import Environment, LightKind, Material, Mesh, PunctualLight, Scene
@@ -157,8 +158,6 @@ def test_other_arrays_are_refused(values: np.ndarray) -> None:
 
 
 def test_meshes_know_their_place_in_the_light_map(quad: Callable) -> None:
-    from kiln_workers.render.materials import LIGHTMAP, vertex_attributes
-
     mesh: Mesh = with_charts(Scene((quad((0, 0, 0), (0, 0, 1), (1, 0, 0)),), (Material("m"),))).meshes[0]
     assert mesh.lightmap_uv is not None
     for turned, side in ((False, 1.0), (True, -1.0)):

@@ -28,8 +28,8 @@ from kiln_workers.sphere import octahedral
 Float16 = npt.NDArray[np.float16]
 Int64 = npt.NDArray[np.int64]
 
-BYTES_PER_LANE: Final = 192
-"""Inputs, outputs and their copies in NumPy, per lane of a wavefront (measured by benchmarks/render.py)."""
+BYTES_PER_LANE: Final = 384
+"""Inputs, outputs, copies in NumPy and shares of the paths, per lane of a wavefront (benchmarks/render.py)."""
 
 LARGEST_WAVEFRONT: Final = 1 << 22
 SMALLEST_WAVEFRONT: Final = 1 << 12
@@ -153,12 +153,10 @@ class TileRenderer:
         even = adaptive.even_samples(samples)
         out = np.zeros((len(texels), size * size, 3), np.float16)
         paths = overflows = 0
-        for first, lanes in self._whole_images(texels, offsets):
-            begun = first / len(texels)
-            share = (int(lanes[-1, 0]) + 1 - first) / len(texels) if len(lanes) else 0.0
+        for images, lanes in self._whole_images(texels, offsets):
 
-            def report(done: float, begun: float = begun, share: float = share) -> None:
-                on_progress(begun + share * done)
+            def report(done: float, images: range = images) -> None:
+                on_progress((images.start + done * len(images)) / len(texels))
 
             count = np.full(len(lanes), even)
             sums = self._trace_lanes(texels, lanes, count, 0, lambda done: report(done * even / samples))
@@ -205,13 +203,12 @@ class TileRenderer:
     ) -> Float32:
         """What lanes [L] add up over `samples` [L] paths after the first `done`: a row [L, 7] of sums each."""
         out = np.zeros((len(lanes), 7), np.float32)
-        for first in range(0, len(lanes), self.wavefront):
-            part = slice(first, first + self.wavefront)
+        for part, fraction in self._wavefronts(np.arange(len(lanes))):
             sums = self._trace_pixels(texels, lanes[part, 0], lanes[part, 1], samples[part], done)
             out[part, RADIANCE] = to_numpy(sums.radiance)
             for number, values in enumerate((sums.weight, sums.square, sums.paths, sums.dropped), start=WEIGHT):
                 out[part, number] = np.array(values)
-            on_progress(min(first + self.wavefront, len(lanes)) / len(lanes))
+            on_progress(fraction)
         return out
 
     def _trace_pixels(self, texels: TexelBatch, texel: Int64, pixel: Int64, samples: Int64, done: int) -> LaneSums:
@@ -340,8 +337,8 @@ class TileRenderer:
             on_progress(min(first + group, len(texels)) / len(texels))
         return out.reshape(len(texels), size, size, 3)
 
-    def _whole_images(self, texels: TexelBatch, offsets: Int64 | None) -> Iterator[tuple[int, Int64]]:
-        """The first texel of each group, and (texel, pixel) [L, 2] of the group's pixels above the horizon.
+    def _whole_images(self, texels: TexelBatch, offsets: Int64 | None) -> Iterator[tuple[range, Int64]]:
+        """The texels of each group, and (texel, pixel) [L, 2] of the group's pixels above the horizon.
 
         A group has about as many pixels as a wavefront. With `offsets` only one pixel of each 2 x 2 block is listed.
         """
@@ -354,7 +351,7 @@ class TileRenderer:
             if offsets is not None:
                 inside = np.stack(np.divmod(lanes[:, 1], size), axis=1) % 2
                 lanes = lanes[(inside == offsets[lanes[:, 0]]).all(axis=1)]
-            yield first, lanes
+            yield range(first, min(first + group, len(texels))), lanes
 
     def _wavefronts(self, lanes: Int64) -> Iterator[tuple[Int64, float]]:
         for first in range(0, len(lanes), self.wavefront):

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -24,30 +25,38 @@ from kiln_workers.stages.tiles import map_coordinates, tiles_of, with_render_ver
 from kiln_workers.store.light_field import LightFieldStore
 
 
+@dataclass(frozen=True)
+class _LightMap:
+    """What was rendered: where it is stored, the texels, and by tile those that count."""
+
+    store: LightFieldStore
+    texels: TexelMap
+    covered: Mapping[Tile, Index]
+
+    def source(self, function: Function) -> StoreSource:
+        """The images of a function, tile by tile."""
+        return StoreSource(self.store, function, self.texels.state, self.texels.normal, list(self.covered))
+
+
 def run(payload: FitPayload, context: Context) -> FitResult:
     """The function's lobes as far as a fit of the whole light map at once makes them."""
     texel_map = with_render_verdict(unpack_texel_map(context.blob(payload.texel_map)), payload.renders)
     store = LightFieldStore.open(payload.store_url)
     covered = {tile: valid_texels(texel_map.state, tile) for tile in tiles_of(payload.renders)}
+    light_map = _LightMap(store, texel_map, covered)
     with store.all_lost([payload.function.value, ARRAY_IRRADIANCE], covered):
         if payload.settings.fit.solver is Solver.COHERENT:
-            result = _start(payload, context, store, texel_map, covered)
+            result = _start(payload, context, light_map)
         else:
-            result = _train(payload, context, store, texel_map, covered)
+            result = _train(payload, context, light_map)
     context.log(f"{payload.function.value}: log_mse_rel {result.metrics.log_mse_rel:.4f}")
     return result
 
 
-def _train(
-    payload: FitPayload,
-    context: Context,
-    store: LightFieldStore,
-    texel_map: TexelMap,
-    covered: Mapping[Tile, Index],
-) -> FitResult:
+def _train(payload: FitPayload, context: Context, light_map: "_LightMap") -> FitResult:
     """Train the network from the store, going on from the last published checkpoint where there is one."""
     function, asked = payload.function, payload.settings.fit
-    source: TexelSource = StoreSource(store, function, texel_map.state, texel_map.normal, list(covered))
+    source: TexelSource = light_map.source(function)
     if function is Function.VISIBILITY:
         source = PooledSource(source)
     checkpoint = context.last_checkpoint()
@@ -57,9 +66,9 @@ def _train(
         context.progress(at.done, at.total, at.unit, at.message, at.loss)
 
     def negligible(exposure: float) -> bool:
-        valid = texel_map.state == TexelState.VALID
+        valid = light_map.texels.state == TexelState.VALID
         light = function is Function.LIGHT_FIELD
-        return light and is_negligible(exposure, store.read_irradiance(list(covered))[valid])
+        return light and is_negligible(exposure, light_map.store.read_irradiance(list(light_map.covered))[valid])
 
     outcome = train(
         source,
@@ -84,20 +93,15 @@ def _train(
     )
 
 
-def _start(
-    payload: FitPayload,
-    context: Context,
-    store: LightFieldStore,
-    texel_map: TexelMap,
-    covered: Mapping[Tile, Index],
-) -> FitResult:
+def _start(payload: FitPayload, context: Context, light_map: "_LightMap") -> FitResult:
     """Find what the coherent descent of all blocks starts from; its metrics are of the texels chosen for that."""
     began = time.perf_counter()
     settings = payload.settings.fit
-    source = StoreSource(store, payload.function, texel_map.state, texel_map.normal, list(covered))
+    store, texel_map = light_map.store, light_map.texels
+    source = light_map.source(payload.function)
     require_texels(source, payload.function)
     exposure = exposure_of(source, payload.function)
-    chosen, step = _chosen(texel_map, covered)
+    chosen, step = _chosen(texel_map, light_map.covered)
     field = read_texels(store, payload.function, texel_map, chosen, exposure, pooled_size(store.image_size))
     options, curve = CoherentOptions(steps=settings.start_steps), Curve()
 

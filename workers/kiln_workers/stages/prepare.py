@@ -1,7 +1,7 @@
 """Read the scene, give it a light map, lay out the store: everything the farm needs before the first ray."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -90,7 +90,7 @@ def run(payload: PreparePayload, context: Context) -> PrepareResult:
     fine_path = _texel_map_file(scene, fine_side, context) if finer else path
     step(5)
     digest = scene_hash(scene, settings.render)
-    cache = _put_cache(scene, digest, (path, fine_path), settings.render, context)
+    cache = _put_cache(scene, digest, {lightmap.resolution: path, fine_side: fine_path}, settings.render, context)
     step(6)
     _create_store(payload.store_url, scene, texel_map, digest, settings)
     context.log(f"{scene.triangles} triangles, {texel_map.covered} texels in {len(tiles)} tiles")
@@ -132,17 +132,16 @@ def _put_between(scene: Scene, texel_map: TexelMap, context: Context) -> tuple[s
 
 
 def _put_cache(
-    scene: Scene, digest: str, paths: Sequence[Path], settings: RenderSettings, context: Context
+    scene: Scene, digest: str, files: Mapping[int, Path], settings: RenderSettings, context: Context
 ) -> str | None:
     """The radiance cache as a blob, at the finest of the texel maps that is not too large; None where paths do without.
 
-    The texel maps lie in files, from the coarsest to the finest.
+    `files`: where the texel maps lie, by the texels along each side.
     """
     if not (settings.radiance_cache and settings.max_depth and scene.has_light):
         return None
-    maps = [open_texel_map(path) for path in paths]
-    fitting = [texel_map for texel_map in maps if len(texel_map.state) <= LARGEST_CACHE]
-    texel_map = fitting[-1] if fitting else open_texel_map(_texel_map_file(scene, LARGEST_CACHE, context))
+    side = max((side for side in files if side <= LARGEST_CACHE), default=LARGEST_CACHE)
+    texel_map = open_texel_map(files.get(side) or _texel_map_file(scene, side, context))
 
     def report(done: float) -> None:
         context.progress(5 + done, len(STEPS), "steps", STEPS[5])

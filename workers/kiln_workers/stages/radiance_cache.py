@@ -16,10 +16,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from kiln_schemas.conventions import FP16_MAX
 from kiln_schemas.errors import InputError
 from kiln_schemas.settings import RenderSettings
 from kiln_workers.package.dilate import plan_fill
-from kiln_workers.render.tile import Progress, TexelBatch, TileRenderer, silent
+from kiln_workers.render.tile import Progress, TexelBatch, TileRenderer, silent, to_half
 from kiln_workers.scene.bands import bands
 from kiln_workers.scene.container import pack, unpack
 from kiln_workers.scene.model import Scene
@@ -35,12 +36,11 @@ SAMPLES: Final = 64
 """Paths a texel; each pixel of a light field sees several texels, and none of their noise is its own."""
 
 FRONTS, BACKS = 96, 160
-"""Their random numbers begin after those of the tiles' irradiance (`stages.render.FINE_SEQUENCE`), in light maps."""
+"""Their random numbers begin after so many times the map's texels, and so after those of the tiles' irradiance, which
+end after 16 + 8^2 times the texels of a light map that is no larger (`stages.render.FINE_SEQUENCE`).
+"""
 
-LARGEST_VALUE: Final = 65504.0
-"""fp16's."""
-
-UNKNOWN: Final = -LARGEST_VALUE
+UNKNOWN: Final = -FP16_MAX
 """What the map holds where paths go on: so low that whatever is interpolated with it is negative."""
 
 STEEP: Final = 0.5
@@ -83,7 +83,7 @@ def make_cache(
             values, _, _ = renderer.render_fine_irradiance(
                 renderer.backs(batch) if side else batch, report, punctual=False
             )
-            out[rows][..., 3 * side : 3 * side + 3][place] = np.minimum(values, LARGEST_VALUE)
+            out[rows][..., 3 * side : 3 * side + 3][place] = to_half(values)[0]
             inside[rows][..., side][place] = values[:, 0] < 0.0
         texel_map.release()
     for side in range(sides):
@@ -127,7 +127,7 @@ def unpack_cache(data: bytes) -> Float16:
         or cache.ndim != 3
         or cache.shape[2] not in (3, 6)
         or not cache.size
-        or not ((cache >= 0.0) & (cache <= LARGEST_VALUE) | (cache == UNKNOWN)).all()
+        or not ((cache >= 0.0) & (cache <= FP16_MAX) | (cache == UNKNOWN)).all()
     ):
         raise InputError(
             "the array 'irradiance' is missing, misshapen or no light", where=KIND, remedy="Run prepare again."
